@@ -1,0 +1,1 @@
+"""Safe reinforcement learning by reconnaissance and planning, in JAX."""

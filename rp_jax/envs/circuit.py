@@ -1,0 +1,183 @@
+"""Circuit: drive as far as possible along a walled track in 200 steps (paper, appendix F)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from rp_jax import sensing
+from rp_jax.envs import base, tracks
+from rp_jax.hazards import SubRMDP, WallPoint
+from rp_jax.kinematics import (
+    AgentModel,
+    Vehicle,
+    angle_of,
+    control_table,
+    independent_controls,
+    make_vehicle,
+    rotate,
+    to_ego,
+)
+from rp_jax.validate import one_of, positive
+
+ACCELERATIONS = (-0.02, 0.0, 0.02)  # room units / step^2
+TURNS = (-0.15, -0.05, 0.0, 0.05, 0.15)  # radians / step
+SPEEDS = tuple(round(0.02 * k, 2) for k in range(-2, 6))  # -.04 .. .1 room units / step
+LIDAR_BINS = 360
+FIDELITIES = ("released", "paper")
+
+
+class State(struct.PyTreeNode):
+    """Where the vehicle is and how far it has come."""
+
+    agent: Vehicle
+    index: Array  # () int32, of the nearest centre point
+    time: Array  # () int32, steps since the start
+
+
+class Params(struct.PyTreeNode):
+    """Build by `make_params`; every field that is an array can be swept by `vmap`."""
+
+    agent: AgentModel
+    wall: WallPoint
+    track: tracks.Track
+    edges: Array  # (361, 2) directions of the LIDAR bins' edges
+    time_limit: Array  # () int32, steps
+    stop_speed: Array  # () slower than this costs 1
+    beta: Array  # () discount of danger
+    fidelity: str = struct.field(pytree_node=False, default="released")
+
+
+def make_params(
+    track: str | tracks.TrackPlan = "default",
+    *,
+    time_limit: int = 200,
+    radius: float = 0.1,
+    horizon: int = 5,
+    beta: float = 0.999,
+    fidelity: str = "released",
+) -> Params:
+    """The task's parameters, checked.
+
+    Args:
+        track: "default", "narrowed", "circle", or a `TrackPlan` of one's own.
+        time_limit: steps of an episode.
+        radius: of the vehicle, room units.
+        horizon: steps after which a rollout of the threat is cut.
+        beta: discount of danger in the threat.
+        fidelity: "released" earns nothing for crossing the lap line, as the published numbers
+            did; "paper" counts it as any other progress.
+
+    Raises:
+        ValueError: a value is out of range, or the track cannot be driven.
+    """
+    one_of("fidelity", fidelity, FIDELITIES)
+    positive("time_limit", time_limit, integer=True)
+    positive("horizon", horizon, integer=True)
+    positive("radius", radius)
+    positive("beta", beta, most=1.0)
+    if isinstance(track, str):
+        track = tracks.PLANS[one_of("track", track, tracks.PLANS)]()
+    agent = AgentModel(
+        actions=control_table(ACCELERATIONS, TURNS),
+        baseline=independent_controls(
+            ACCELERATIONS, (0.2, 0.6, 0.2), (TURNS[0], 0.0, TURNS[-1]), (0.2, 0.6, 0.2)
+        ),
+        speeds=jnp.asarray(SPEEDS, float),
+    )
+    wall = WallPoint.create(agent, radius, horizon)
+    corner = np.maximum(np.abs(np.asarray(wall.window.lower)), np.asarray(wall.window.upper))
+    return Params(
+        agent=agent,
+        wall=wall,
+        track=tracks.make_track(track, radius, float(np.hypot(*corner))),
+        edges=sensing.bin_edges(LIDAR_BINS),
+        time_limit=jnp.asarray(time_limit, jnp.int32),
+        stop_speed=jnp.asarray(0.005, float),
+        beta=jnp.asarray(beta, float),
+        fidelity=fidelity,
+    )
+
+
+def start_at(agent: Vehicle, params: Params) -> State:
+    """A state with the vehicle anywhere, at time 0."""
+    index = params.track.nearest_centre.nearest(agent.position)
+    return State(agent=agent, index=index, time=jnp.asarray(0, jnp.int32))
+
+
+def demo_start(params: Params) -> State:
+    """At the first centre point, along the track, at rest: the start of figure 6."""
+    track = params.track
+    return start_at(make_vehicle(track.centre[0], angle_of(track.direction[0]), 0.0), params)
+
+
+def reset(key: Array, params: Params) -> State:
+    """A random centre point, up to 45 degrees off the track's direction, at rest."""
+    where, turn = jax.random.split(key)
+    i = jax.random.randint(where, (), 0, params.track.centre.shape[0])
+    angle = jax.random.uniform(turn, (), float, -jnp.pi / 4, jnp.pi / 4)
+    heading = rotate(params.track.direction[i], jnp.stack([jnp.cos(angle), jnp.sin(angle)]))
+    position = params.track.centre[i]
+    return start_at(Vehicle(position=position, heading=heading, speed=jnp.zeros(())), params)
+
+
+def step(
+    key: Array, state: State, action: Array, params: Params
+) -> tuple[State, base.Outcome]:
+    """One transition; `key` is not used, since nothing here is random.
+
+    The reward is the number of centre points passed, less 1 when (almost) standing still.
+    """
+    del key
+    control = jax.tree.map(lambda table: table[action], params.agent.actions)
+    reached = start_at(params.agent.step(state.agent, control), params)
+    reached = reached.replace(time=state.time + 1)
+    crashed = causes(reached, params)["wall"]
+    n = params.track.centre.shape[0]
+    passed = reached.index - state.index
+    if params.fidelity == "released":
+        progress = jnp.where(jnp.abs(passed) >= n // 4, 0, passed)
+    else:
+        progress = (passed + n // 2) % n - n // 2
+    stopped = jnp.abs(reached.agent.speed) < params.stop_speed
+    reward = progress.astype(params.stop_speed.dtype) - stopped
+    terminated, truncated = base.ended(crashed, reached.time, params.time_limit)
+    return reached, base.Outcome(
+        reward=reward,
+        danger=crashed.astype(reward.dtype),
+        terminated=terminated,
+        truncated=truncated,
+        goal=jnp.zeros_like(crashed),
+    )
+
+
+def observe(state: State, params: Params) -> Array:
+    """(364,) LIDAR (360), x, y, direction of the track relative to the heading, speed."""
+    agent, track = state.agent, params.track
+    points = track.walls_in_view.near(agent.position)
+    scan = sensing.lidar(points, agent.position, agent.heading, params.edges, tracks.VIEW)
+    bend = angle_of(to_ego(track.onward[state.index], agent.heading))
+    return jnp.concatenate([scan, agent.position, jnp.stack([bend, agent.speed])])
+
+
+def hazards(state: State, params: Params) -> dict[str, base.Hazards]:
+    """The wall points near the vehicle."""
+    points = params.track.walls_in_reach.near(state.agent.position)
+    return {"wall": base.Hazards(points, points[:, 0] < sensing.FAR)}
+
+
+def causes(state: State, params: Params) -> dict[str, Array]:
+    """Whether the wall is being hit."""
+    points = params.track.walls_in_contact.near(state.agent.position)
+    return {"wall": jnp.any(jax.vmap(params.wall.hits, (None, 0))(state.agent, points))}
+
+
+def sub_rmdps(params: Params) -> dict[str, SubRMDP]:
+    """One agent and one wall point."""
+    return {"wall": SubRMDP(agent=params.agent, source=params.wall, beta=params.beta)}
+
+
+def num_actions(params: Params) -> int:
+    """15 = 3 accelerations x 5 turns."""
+    return params.agent.actions.acceleration.shape[-1]

@@ -1,0 +1,356 @@
+"""Jam: leave a room through its exit among randomly moving obstacles (paper, appendix F)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from rp_jax import sensing
+from rp_jax.envs import base
+from rp_jax.hazards import MovingObstacle, SubRMDP, WallPoint
+from rp_jax.kinematics import (
+    AgentModel,
+    Control,
+    Vehicle,
+    angle_of,
+    control_table,
+    independent_controls,
+    make_vehicle,
+    rotate,
+    to_ego,
+)
+from rp_jax.validate import number, one_of, positive
+
+ROOM = 3.0  # side of the square room
+EXIT = (2.2, 3.0)  # gap in the top wall
+ACCELERATIONS = (-0.02, 0.0, 0.02)  # room units / step^2
+TURNS = (-0.3, -0.1, 0.0, 0.1, 0.3)  # radians / step
+SPEEDS = tuple(round(0.02 * k, 2) for k in range(-5, 6))  # -.1 .. .1 room units / step
+OBSTACLE_SPEEDS = (0.0, 0.02, 0.04, 0.06)
+OBSTACLE_TURNS = (-0.15, -0.05, 0.0, 0.05, 0.15)
+CLEARANCE = 1.0  # obstacles appear at least this far from the agent
+ZONE = 0.5  # side (released) or radius (paper) of the corner safety zones
+LIDAR_BINS = 360
+SEEN_OBSTACLES = 8
+UNSEEN = (-1.5, -1.51)  # where the observation puts obstacles that do not exist
+FIDELITIES = ("released", "paper")
+MOST_OBSTACLES = 400  # of radius .1: more leave no free place in the room
+
+
+class State(struct.PyTreeNode):
+    """The agent, the obstacles, and the progress made."""
+
+    agent: Vehicle
+    obstacles: Vehicle  # leading axis (N,)
+    present: Array  # (N,) bool; "paper" obstacles disappear in the safety zones
+    progress: Array  # () -20 x distance to the goal (rounded in "released")
+    time: Array  # () int32, steps since the start
+
+
+class Draws(struct.PyTreeNode):
+    """All random numbers of one step: feed recorded ones to replay a transition."""
+
+    controls: Control  # (N,) of the obstacles
+    relocated: Vehicle  # (N,) where an obstacle that has left the room appears again
+
+
+class Params(struct.PyTreeNode):
+    """Build by `make_params`; every field that is an array can be swept by `vmap`."""
+
+    agent: AgentModel
+    wall: WallPoint
+    obstacle: MovingObstacle
+    start: Vehicle
+    goal: Array  # (2,) the point that progress is measured to
+    walls_in_view: sensing.PointGrid
+    walls_in_contact: sensing.PointGrid
+    walls_in_reach: sensing.PointGrid
+    edges: Array  # (361, 2) directions of the LIDAR bins' edges
+    time_limit: Array  # () int32, steps
+    stop_speed: Array  # () slower than this costs .05
+    radius: Array  # () of every vehicle
+    beta: Array  # () discount of danger
+    num_obstacles: int = struct.field(pytree_node=False, default=8)
+    fidelity: str = struct.field(pytree_node=False, default="released")
+
+
+def wall_points() -> np.ndarray:
+    """(559, 2) the room's walls, a point every .02, without the exit."""
+    way = np.arange(150) * 0.02
+    bottom, left = np.stack([way, 0 * way], 1), np.stack([0 * way, way], 1)
+    top = np.stack([way, 0 * way + ROOM], 1)
+    right = np.stack([0 * way + ROOM, way], 1)
+    walls = np.concatenate([bottom, top[way < EXIT[0] - 1e-9], left, right])
+    _, first = np.unique(walls.round(9), axis=0, return_index=True)
+    return walls[np.sort(first)]
+
+
+def make_params(
+    num_obstacles: int = 8,
+    *,
+    time_limit: int = 100,
+    radius: float = 0.1,
+    beta: float = 0.999,
+    wall_horizon: int = 5,
+    obstacle_horizon: int = 8,
+    fidelity: str = "released",
+) -> Params:
+    """The task's parameters, checked.
+
+    Args:
+        num_obstacles: 8 in the paper; 3 and 15 for transfer.
+        time_limit: steps of an episode.
+        radius: of every vehicle, room units.
+        beta: discount of danger in the threat.
+        wall_horizon: steps after which the threat of a wall point is cut.
+        obstacle_horizon: steps after which the threat of an obstacle is cut.
+        fidelity: "released" rounds progress to whole points and relocates obstacles that leave
+            the room or enter a square safety zone; "paper" does not round, and obstacles
+            disappear, in quarter circles.
+
+    Raises:
+        ValueError: a value is out of range.
+    """
+    one_of("fidelity", fidelity, FIDELITIES)
+    number("num_obstacles", num_obstacles, least=0, most=MOST_OBSTACLES, integer=True)
+    positive("time_limit", time_limit, integer=True)
+    positive("radius", radius, most=0.2)
+    positive("beta", beta, most=1.0)
+    positive("wall_horizon", wall_horizon, integer=True)
+    positive("obstacle_horizon", obstacle_horizon, integer=True)
+    agent = AgentModel(
+        actions=control_table(ACCELERATIONS, TURNS),
+        baseline=independent_controls(
+            ACCELERATIONS, (0.2, 0.6, 0.2), (TURNS[0], 0.0, TURNS[-1]), (0.2, 0.6, 0.2)
+        ),
+        speeds=jnp.asarray(SPEEDS, float),
+    )
+    behaviour = independent_controls(
+        ACCELERATIONS, (0.2, 0.6, 0.2), OBSTACLE_TURNS, (0.2, 0.2, 0.2, 0.2, 0.2)
+    )
+    wall = WallPoint.create(agent, radius, wall_horizon)
+    obstacle = MovingObstacle.create(
+        agent, jnp.asarray(OBSTACLE_SPEEDS, float), behaviour, 2 * radius, obstacle_horizon
+    )
+    corner = np.maximum(np.abs(np.asarray(wall.window.lower)), np.asarray(wall.window.upper))
+    walls = wall_points()
+    return Params(
+        agent=agent,
+        wall=wall,
+        obstacle=obstacle,
+        start=make_vehicle((0.2, 0.2), 0.0, 0.0),
+        goal=jnp.asarray((2.6, 3.0), float),
+        walls_in_view=sensing.points_within(walls, 1.0, 0.2),
+        walls_in_contact=sensing.points_within(walls, radius, 0.1),
+        walls_in_reach=sensing.points_within(walls, float(np.hypot(*corner)), 0.2),
+        edges=sensing.bin_edges(LIDAR_BINS),
+        time_limit=jnp.asarray(time_limit, jnp.int32),
+        stop_speed=jnp.asarray(0.005, float),
+        radius=jnp.asarray(radius, float),
+        beta=jnp.asarray(beta, float),
+        num_obstacles=num_obstacles,
+        fidelity=fidelity,
+    )
+
+
+def _progress(agent: Vehicle, params: Params) -> Array:
+    progress = -20 * jnp.sqrt(jnp.sum(jnp.square(params.goal - agent.position)))
+    return jnp.round(progress) if params.fidelity == "released" else progress
+
+
+def start_at(agent: Vehicle, obstacles: Vehicle, params: Params) -> State:
+    """A state with the agent and the obstacles (N,) anywhere, at time 0."""
+    return State(
+        agent=agent,
+        obstacles=obstacles,
+        present=jnp.ones(obstacles.speed.shape, bool),
+        progress=_progress(agent, params),
+        time=jnp.asarray(0, jnp.int32),
+    )
+
+
+def _appear(key: Array, agent: Vehicle, params: Params, needed: Array) -> Vehicle:
+    """An obstacle anywhere in the room, CLEARANCE away from the agent, by rejection.
+
+    Where it is not `needed`, the first draw is good enough.
+    """
+
+    def draw(carry):
+        attempt, _ = carry
+        low, high = params.radius, ROOM - params.radius
+        return attempt + 1, jax.random.uniform(
+            jax.random.fold_in(key, attempt), (2,), low.dtype, low, high
+        )
+
+    def rejected(carry):
+        near = jnp.sum(jnp.square(carry[1] - agent.position)) < CLEARANCE**2
+        return near & needed
+
+    speeds = params.obstacle.speeds
+    _, position = jax.lax.while_loop(rejected, draw, draw((jnp.asarray(0), None)))
+    turn, pick = jax.random.split(jax.random.fold_in(key, -1))
+    angle = jax.random.uniform(turn, (), low_dtype(params), -jnp.pi, jnp.pi)
+    return make_vehicle(position, angle, jax.random.choice(pick, speeds))
+
+
+def low_dtype(params: Params):
+    """The floating-point type of the parameters."""
+    return params.radius.dtype
+
+
+def _obstacle_keys(key: Array, count: int) -> Array:
+    """Obstacle n's key depends on n alone: it evolves alike among 1, 3 or 15."""
+    return jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(count))
+
+
+def reset(key: Array, params: Params) -> State:
+    """The agent in its corner, the obstacles anywhere at least CLEARANCE away from it."""
+    keys = _obstacle_keys(key, params.num_obstacles)
+    appear = jax.vmap(_appear, (0, None, None, None))
+    return start_at(params.start, appear(keys, params.start, params, jnp.asarray(True)), params)
+
+
+def _out_of_place(position: Array, params: Params) -> Array:
+    """() bool, an obstacle at `position` (2,) has left the room or entered a safety zone."""
+    low, high = params.radius, ROOM - params.radius
+    outside = jnp.any((position <= low) | (position >= high))
+    corners = jnp.asarray([[0.0, 0.0], [0.0, ROOM], [ROOM, 0.0]], position.dtype)
+    offset = jnp.abs(position[None] - corners)
+    if params.fidelity == "released":
+        in_zone = jnp.any(jnp.all(offset < ZONE, axis=-1))
+    else:
+        in_zone = jnp.any(jnp.sum(jnp.square(offset), axis=-1) < ZONE**2)
+    return outside | in_zone
+
+
+def draw(key: Array, state: State, action: Array, params: Params) -> Draws:
+    """The random numbers of the step from `state` under `action`."""
+    keys = jax.vmap(jax.random.split)(_obstacle_keys(key, params.num_obstacles))
+    controls = jax.vmap(params.obstacle.draw)(keys[:, 0])
+    # Obstacles appear away from where the agent will be.
+    agent = _move_agent(state, action, params)
+    moved = _move_obstacles(state, controls, params)
+    needed = jax.vmap(_out_of_place, (0, None))(moved.position, params)
+    relocated = jax.vmap(_appear, (0, None, None, 0))(keys[:, 1], agent, params, needed)
+    return Draws(controls=controls, relocated=relocated)
+
+
+def _move_agent(state: State, action: Array, params: Params) -> Vehicle:
+    control = jax.tree.map(lambda table: table[action], params.agent.actions)
+    return params.agent.step(state.agent, control)
+
+
+def _move_obstacles(state: State, controls: Control, params: Params) -> Vehicle:
+    return jax.vmap(params.obstacle.step, (0, None, 0))(state.obstacles, state.agent, controls)
+
+
+def transition(
+    state: State, action: Array, draws: Draws, params: Params
+) -> tuple[State, base.Outcome]:
+    """The deterministic part of `step`: everything, given the random numbers.
+
+    Reward (appendix F): 20 x the way made towards the goal - .05 - .05 when (almost) standing
+    still + 10 at the goal.
+    """
+    agent = _move_agent(state, action, params)
+    obstacles = _move_obstacles(state, draws.controls, params)
+    gone = jax.vmap(_out_of_place, (0, None))(obstacles.position, params)
+    present = state.present
+    if params.fidelity == "released":
+        obstacles = jax.vmap(base.select)(gone, draws.relocated, obstacles)
+    else:
+        present = present & ~gone
+    reached = State(
+        agent=agent,
+        obstacles=obstacles,
+        present=present,
+        progress=_progress(agent, params),
+        time=state.time + 1,
+    )
+    hit = causes(reached, params)
+    crashed = hit["wall"] | hit["obstacle"]
+    goal = (agent.position[1] > ROOM) & ~crashed
+    stopped = jnp.abs(agent.speed) < params.stop_speed
+    reward = reached.progress - state.progress - 0.05 - 0.05 * stopped + 10.0 * goal
+    terminated, truncated = base.ended(crashed | goal, reached.time, params.time_limit)
+    return reached, base.Outcome(
+        reward=reward,
+        danger=crashed.astype(reward.dtype),
+        terminated=terminated,
+        truncated=truncated,
+        goal=goal,
+    )
+
+
+def step(
+    key: Array, state: State, action: Array, params: Params
+) -> tuple[State, base.Outcome]:
+    """One transition: agent and obstacles move, stray obstacles are relocated, crashes found."""
+    return transition(state, action, draw(key, state, action, params), params)
+
+
+def _seen_obstacles(state: State) -> Array:
+    """(8, 4) the nearest obstacles by distance: x, y, heading in the agent's frame, speed."""
+    agent, others = state.agent, state.obstacles
+    missing = max(0, SEEN_OBSTACLES - others.speed.shape[0])
+    offset = others.position - agent.position[None]
+    unseen = jnp.asarray(UNSEEN, offset.dtype)
+    offset = jnp.where(state.present[:, None], offset, unseen[None])
+    facing = jnp.where(state.present[:, None], others.heading, -agent.heading[None])
+    speed = jnp.where(state.present, others.speed, agent.speed)
+    # Obstacles that do not exist stand at UNSEEN (world frame), facing the agent's back.
+    pad = ((0, missing), (0, 0))
+    offset = jnp.pad(offset, pad).at[len(speed) :].set(unseen)
+    facing = jnp.pad(facing, pad).at[len(speed) :].set(-agent.heading)
+    speed = jnp.pad(speed, pad[0]).at[len(others.speed) :].set(agent.speed)
+    local = to_ego(offset, agent.heading)
+    turn = angle_of(to_ego(facing, agent.heading))
+    rows = jnp.concatenate([local, turn[:, None], speed[:, None]], axis=-1)
+    squared = jnp.sum(jnp.square(offset), axis=-1)
+    # The rank by counting is faster than a sort for such short lists.
+    count = jnp.arange(len(squared))
+    ahead = (squared[None, :] < squared[:, None]) | (
+        (squared[None, :] == squared[:, None]) & (count[None, :] < count[:, None])
+    )
+    rank = jnp.sum(ahead, axis=-1)
+    return jnp.zeros((SEEN_OBSTACLES, 4), rows.dtype).at[rank].set(rows, mode="drop")
+
+
+def observe(state: State, params: Params) -> Array:
+    """(396,) LIDAR of the walls (360), 8 nearest obstacles (32), x, y, heading angle, speed."""
+    agent = state.agent
+    points = params.walls_in_view.near(agent.position)
+    scan = sensing.lidar(points, agent.position, agent.heading, params.edges)
+    pose = jnp.stack([angle_of(agent.heading), agent.speed])
+    return jnp.concatenate([scan, _seen_obstacles(state).reshape(-1), agent.position, pose])
+
+
+def hazards(state: State, params: Params) -> dict[str, base.Hazards]:
+    """The wall points near the agent, and all obstacles."""
+    points = params.walls_in_reach.near(state.agent.position)
+    return {
+        "wall": base.Hazards(points, points[:, 0] < sensing.FAR),
+        "obstacle": base.Hazards(state.obstacles, state.present),
+    }
+
+
+def causes(state: State, params: Params) -> dict[str, Array]:
+    """Whether the wall or an obstacle is being hit."""
+    points = params.walls_in_contact.near(state.agent.position)
+    walls = jax.vmap(params.wall.hits, (None, 0))(state.agent, points)
+    others = jax.vmap(params.obstacle.hits, (None, 0))(state.agent, state.obstacles)
+    return {"wall": jnp.any(walls), "obstacle": jnp.any(others & state.present)}
+
+
+def sub_rmdps(params: Params) -> dict[str, SubRMDP]:
+    """One agent and one wall point; one agent and one obstacle."""
+    return {
+        "wall": SubRMDP(agent=params.agent, source=params.wall, beta=params.beta),
+        "obstacle": SubRMDP(agent=params.agent, source=params.obstacle, beta=params.beta),
+    }
+
+
+def num_actions(params: Params) -> int:
+    """15 = 3 accelerations x 5 turns."""
+    return params.agent.actions.acceleration.shape[-1]

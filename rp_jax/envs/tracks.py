@@ -1,0 +1,191 @@
+"""Tracks as data: a centre line, two walls, and a small builder for one's own."""
+
+from dataclasses import dataclass, field, replace
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from rp_jax import sensing
+
+SPACING = 0.02  # of points along straights, room units
+CELL = 0.2  # width of the look-up cells, room units
+VIEW = 1.0  # range of the LIDAR, room units
+
+
+@dataclass(frozen=True)
+class TrackPlan:
+    """A centre line drawn from (0, 0) along +x, one piece after another; each call returns a new
+    plan, the old one is left as it was.
+
+    >>> TrackPlan().straight(2.0).curve(1.0, 180).straight(2.0).curve(1.0, 180)
+    """
+
+    half_width: float = 0.3
+    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))  # (n, 2)
+    angles: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (n,) heading, radians
+    position: tuple[float, float] = (0.0, 0.0)
+    angle: float = 0.0  # heading at `position`, radians
+
+    def _extend(self, points, angles, position, angle) -> "TrackPlan":
+        return replace(
+            self,
+            points=np.concatenate([self.points, points]),
+            angles=np.concatenate([self.angles, angles]),
+            position=(float(position[0]), float(position[1])),
+            angle=float(angle),
+        )
+
+    def straight(self, length: float) -> "TrackPlan":
+        """Goes straight on for `length` > 0, rounded up to whole steps of SPACING."""
+        if not (np.isfinite(length) and length > 0):
+            raise ValueError(f"straight: length is {length}; it must be positive and finite")
+        count = int(np.ceil(length / SPACING - 1e-6))
+        way = np.arange(count + 1)[:, None] * SPACING
+        points = np.asarray(self.position) + way * [np.cos(self.angle), np.sin(self.angle)]
+        return self._extend(points[:-1], np.full(count, self.angle), points[-1], self.angle)
+
+    def curve(self, radius: float, degrees: float) -> "TrackPlan":
+        """Turns by whole `degrees` (left is positive) on a circle of `radius` > 0."""
+        if not (np.isfinite(radius) and radius > 0):
+            raise ValueError(f"curve: radius is {radius}; it must be positive and finite")
+        if degrees == 0 or degrees != round(degrees):
+            raise ValueError(f"curve: degrees is {degrees}; it must be a whole number, not 0")
+        side = np.sign(degrees)
+        turn = np.radians(np.arange(abs(int(degrees)) + 1)) * side
+        angles = self.angle + turn
+        outward = np.stack([np.sin(angles), -np.cos(angles)], axis=-1) * side
+        centre = np.asarray(self.position) - radius * outward[0]
+        points = centre + radius * outward
+        return self._extend(points[:-1], angles[:-1], points[-1], angles[-1])
+
+    def close(self, radius: float = 0.3) -> "TrackPlan":
+        """Drives home to the start: straight, one turn of `radius`, straight along +x."""
+        left = (-np.degrees(self.angle) + 180) % 360 - 180
+        turn = round(left)
+        if abs(left - turn) > 1e-6:
+            raise ValueError(f"close: {left} degrees are left to turn; they must be whole")
+        sine = np.sin(self.angle)
+        # The turn ends on the line y = 0 if it starts at this height.
+        height = radius * abs(1 - np.cos(self.angle)) * np.sign(self.position[1])
+        ahead = 0.0 if abs(sine) < 1e-9 else (height - self.position[1]) / sine
+        if ahead < 0 or self.position[0] >= 0:
+            raise ValueError(
+                f"close: from {self.position} heading {np.degrees(self.angle):.0f} degrees one "
+                "turn does not lead home; aim at the line y = 0 left of the start"
+            )
+        plan = self.straight(ahead) if ahead > 1e-9 else self
+        plan = plan.curve(radius, turn) if turn else plan
+        if plan.position[0] >= 0:
+            raise ValueError(f"close: the turn ends at x = {plan.position[0]:.3f}; it must be < 0")
+        plan = plan.straight(-plan.position[0])
+        # The last straight keeps its end point, as the released track does.
+        end = np.asarray([plan.position])
+        return plan._extend(end, np.asarray([plan.angle]), plan.position, plan.angle)
+
+    def widened(self, half_width: float) -> "TrackPlan":
+        """The same centre line with another half-width."""
+        return replace(self, half_width=half_width)
+
+
+def default_plan() -> TrackPlan:
+    """The paper's circuit (figure 6, top), 1,253 points."""
+    plan = TrackPlan().straight(2.0).curve(0.3, 45).straight(1.0).curve(1.0, 225)
+    plan = plan.curve(0.5, -145).straight(1.5).curve(1.2, 75).straight(0.5).curve(0.3, 110)
+    return plan.straight(0.5).curve(0.3, -90).straight(0.5).curve(0.5, 120).close()
+
+
+def narrowed_plan() -> TrackPlan:
+    """The default circuit with half-width .25 (table 2, "narrowed")."""
+    return default_plan().widened(0.25)
+
+
+def circle_plan() -> TrackPlan:
+    """A circle of radius 3 (table 2, "circular"; figure 6, bottom)."""
+    return TrackPlan().curve(3.0, 360)
+
+
+PLANS = {"default": default_plan, "narrowed": narrowed_plan, "circle": circle_plan}
+
+
+class Track(struct.PyTreeNode):
+    """A closed track, ready for look-ups. Build it by `make_track`."""
+
+    centre: Array  # (n, 2) centre line, in driving order
+    direction: Array  # (n, 2) unit tangents
+    onward: Array  # (n, 2) unit vectors from each centre point to the next
+    walls: Array  # (w, 2) distinct wall points
+    half_width: Array  # ()
+    nearest_centre: sensing.PointGrid
+    walls_in_view: sensing.PointGrid  # within VIEW
+    walls_in_contact: sensing.PointGrid  # within the vehicle's radius
+    walls_in_reach: sensing.PointGrid  # within the threat's window
+
+
+def make_track(plan: TrackPlan, radius: float, reach: float) -> Track:
+    """Checks a plan and prepares its look-up tables.
+
+    Args:
+        plan: a closed centre line.
+        radius: of the vehicle; walls nearer than this are a crash.
+        reach: largest distance at which a wall point can have a threat.
+
+    Raises:
+        ValueError: the track is too narrow, not closed, or crosses itself.
+    """
+    centre, angles = plan.points, plan.angles
+    direction = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    left = np.stack([-direction[:, 1], direction[:, 0]], axis=-1) * plan.half_width
+    _check_plan(plan, radius)
+    walls = np.stack([centre + left, centre - left], axis=1).reshape(-1, 2)
+    # Coinciding points (the hub of a tight turn) are one event: counting it once keeps
+    # Theorem 3's bound, and makes it tighter.
+    _, first = np.unique(walls.round(9), axis=0, return_index=True)
+    walls = walls[np.sort(first)]
+    onward = np.roll(centre, -1, axis=0) - centre
+    return Track(
+        centre=jnp.asarray(centre, float),
+        onward=jnp.asarray(onward / np.linalg.norm(onward, axis=-1, keepdims=True), float),
+        direction=jnp.asarray(direction, float),
+        walls=jnp.asarray(walls, float),
+        half_width=jnp.asarray(plan.half_width, float),
+        nearest_centre=sensing.nearest_of(centre, plan.half_width + CELL, CELL / 2),
+        walls_in_view=sensing.points_within(walls, VIEW, CELL),
+        walls_in_contact=sensing.points_within(walls, radius, CELL / 2),
+        walls_in_reach=sensing.points_within(walls, reach, CELL),
+    )
+
+
+def _check_plan(plan: TrackPlan, radius: float) -> None:
+    centre, width = plan.points, plan.half_width
+    if not (np.isfinite(width) and width > radius):
+        raise ValueError(
+            f"track: half_width is {width}; it must exceed the vehicle's radius, {radius}"
+        )
+    if len(centre) < 8:
+        raise ValueError(f"track: {len(centre)} centre points; at least 8 are needed")
+    gap = np.linalg.norm(np.asarray(plan.position) - centre[0])
+    turn = np.angle(np.exp(1j * (plan.angle - plan.angles[0])))
+    if gap > 3 * SPACING or abs(turn) > np.radians(2):
+        raise ValueError(
+            f"track: the end misses the start by {gap:.3f} units and {np.degrees(turn):.0f} "
+            "degrees; a track must be closed (see TrackPlan.close)"
+        )
+    # Wherever the track is far along but near in space, its two parts would overlap. On a
+    # curve of radius >= half_width that is no nearer than half a turn of that radius.
+    step = np.linalg.norm(np.diff(centre, axis=0, append=centre[:1]), axis=-1)
+    along = np.concatenate([[0.0], np.cumsum(step)[:-1]])
+    total = step.sum()
+    for i in range(0, len(centre), 4):
+        distance = np.linalg.norm(centre - centre[i], axis=-1)
+        way = np.abs(along - along[i])
+        way = np.minimum(way, total - way)
+        clash = (way > np.pi * width) & (distance < 2 * width - 1e-6)
+        if clash.any():
+            j = int(np.argmax(clash))
+            raise ValueError(
+                f"track: it crosses itself: centre points {i} {centre[i].round(2)} and {j} "
+                f"{centre[j].round(2)} are {distance[j]:.2f} apart; at least {2 * width:.2f} "
+                "(two half-widths) are needed"
+            )

@@ -1,0 +1,221 @@
+"""Sources of danger (events E_n), and the sub-R-MDP of one agent and one hazard (Assumption 1)."""
+
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from rp_jax.kinematics import (
+    AgentModel,
+    ControlDistribution,
+    Vehicle,
+    advance,
+    angle_of,
+    make_vehicle,
+    to_ego,
+)
+
+
+class HazardSource(Protocol):
+    """One kind of event: how its hazards move, when they strike, how a model sees them.
+
+    All methods are unbatched. Hazard n never depends on the other hazards (Assumption 1).
+    """
+
+    @property
+    def window(self) -> "Window":
+        """Where the hazard can matter within `horizon` steps; outside it the threat is 0."""
+
+    @property
+    def horizon(self) -> int:
+        """Steps after which a rollout of the sub-R-MDP is cut."""
+
+    def draw(self, key: Array, shape: tuple[int, ...] = ()) -> Any:
+        """The random numbers of one step (or of an array of steps)."""
+
+    def step(self, hazard: Any, agent: Any, noise: Any) -> Any:
+        """The hazard's next state, p(s_n' | s_n, s_o, a)."""
+
+    def hits(self, agent: Any, hazard: Any) -> Array:
+        """() bool, the event's indicator d_n."""
+
+    def features(self, agent: Any, hazard: Any) -> Array:
+        """(F,) what the threat model sees: the agent's frame, relative position first."""
+
+    def mirrored(self, features: Array) -> Array:
+        """`features` (..., F) of the left-right mirrored situation."""
+
+    def sample(self, key: Array, agent: AgentModel) -> tuple[Any, Any]:
+        """An (agent, hazard) pair drawn over the window, every speed included."""
+
+    def state_of(self, features: Array) -> tuple[Any, Any]:
+        """An (agent, hazard) pair that has these features (F,); inverts `features`."""
+
+
+class Window(struct.PyTreeNode):
+    """A box in the agent's frame."""
+
+    lower: Array  # (2,) room units
+    upper: Array  # (2,)
+
+    def contains(self, relative: Array) -> Array:
+        """() bool for a relative position (2,)."""
+        return jnp.all((relative >= self.lower) & (relative <= self.upper), axis=-1)
+
+
+class SubRMDP(struct.PyTreeNode):
+    """The R-MDP of a single hazard: Algorithm 2, line 2, estimates its threat function."""
+
+    agent: AgentModel
+    source: Any  # a HazardSource
+    beta: float = 0.999  # discount of danger
+
+
+def reach(agent: AgentModel, horizon: int) -> tuple[np.ndarray, np.ndarray]:
+    """A box (lower, upper) in the agent's frame that holds it for `horizon` steps.
+
+    Covers every sequence of actions and baseline controls, from every speed.
+    """
+    turns = [np.abs(np.asarray(angle_of(agent.actions.rotation))).max()]
+    turns.append(np.abs(np.asarray(angle_of(agent.baseline.controls.rotation))).max())
+    slow, fast = float(agent.speeds[0]), float(agent.speeds[-1])
+    lower, upper = np.zeros(2), np.zeros(2)
+    for k in range(horizon):
+        swing = min(k * max(turns), np.pi)  # largest change of heading before the k-th move
+        upper[0] += max(fast, slow * np.cos(swing), 0.0)
+        lower[0] += min(slow, fast * np.cos(swing), 0.0)
+        side = max(abs(slow), fast) * np.sin(min(swing, np.pi / 2))
+        upper[1] += side
+        lower[1] -= side
+    return lower, upper
+
+
+def _padded_window(agent: AgentModel, horizon: int, pad: float) -> Window:
+    lower, upper = reach(agent, horizon)
+    return Window(lower=jnp.asarray(lower - pad, float), upper=jnp.asarray(upper + pad, float))
+
+
+def _sample_speed(key: Array, speeds: Array) -> Array:
+    """Half the time one of the reachable speeds, half the time any between the limits."""
+    pick, grid, smooth = jax.random.split(key, 3)
+    discrete = jax.random.choice(grid, speeds)
+    continuous = jax.random.uniform(smooth, (), speeds.dtype, speeds[0], speeds[-1])
+    return jnp.where(jax.random.bernoulli(pick), discrete, continuous)
+
+
+def _sample_relative(key: Array, window: Window) -> Array:
+    return jax.random.uniform(key, (2,), window.lower.dtype, window.lower, window.upper)
+
+
+class WallPoint(struct.PyTreeNode):
+    """A fixed point that must not come nearer than `radius`. The hazard is its position (2,)."""
+
+    radius: Array  # () room units
+    window: Window
+    horizon: int = struct.field(pytree_node=False, default=5)
+
+    @classmethod
+    def create(cls, agent: AgentModel, radius: float = 0.1, horizon: int = 5) -> "WallPoint":
+        """With the window that `agent` can reach in `horizon` steps."""
+        window = _padded_window(agent, horizon, radius)
+        return cls(radius=jnp.asarray(radius, float), window=window, horizon=horizon)
+
+    def draw(self, key: Array, shape: tuple[int, ...] = ()) -> Array:
+        """Nothing is random; zeros keep the signature."""
+        return jnp.zeros(shape)
+
+    def step(self, hazard: Array, agent: Vehicle, noise: Array) -> Array:
+        """A wall stays where it is."""
+        return hazard
+
+    def hits(self, agent: Vehicle, hazard: Array) -> Array:
+        """Nearer than `radius`."""
+        return jnp.sum(jnp.square(hazard - agent.position), axis=-1) < jnp.square(self.radius)
+
+    def features(self, agent: Vehicle, hazard: Array) -> Array:
+        """(3,) position in the agent's frame (2), the agent's speed."""
+        relative = to_ego(hazard - agent.position, agent.heading)
+        return jnp.concatenate([relative, agent.speed[None]])
+
+    def mirrored(self, features: Array) -> Array:
+        """See `HazardSource`."""
+        return features * jnp.asarray([1.0, -1.0, 1.0], features.dtype)
+
+    def sample(self, key: Array, agent: AgentModel) -> tuple[Vehicle, Array]:
+        """See `HazardSource`."""
+        where, fast = jax.random.split(key)
+        vehicle = make_vehicle(jnp.zeros(2), 0.0, _sample_speed(fast, agent.speeds))
+        return vehicle, _sample_relative(where, self.window)
+
+    def state_of(self, features: Array) -> tuple[Vehicle, Array]:
+        """See `HazardSource`."""
+        return make_vehicle(jnp.zeros(2), 0.0, features[2]), features[:2]
+
+
+class MovingObstacle(struct.PyTreeNode):
+    """A vehicle that drives at random; centres nearer than `distance` collide."""
+
+    distance: Array  # () room units, sum of the two radii
+    speeds: Array  # (S,) its reachable speeds, ascending
+    behaviour: ControlDistribution  # what it does at each step
+    window: Window
+    horizon: int = struct.field(pytree_node=False, default=8)
+
+    @classmethod
+    def create(
+        cls,
+        agent: AgentModel,
+        speeds: Array,
+        behaviour: ControlDistribution,
+        distance: float = 0.2,
+        horizon: int = 8,
+    ) -> "MovingObstacle":
+        """With the window from which it and `agent` can meet in `horizon` steps."""
+        pad = distance + horizon * float(np.abs(np.asarray(speeds)).max())
+        return cls(
+            distance=jnp.asarray(distance, float),
+            speeds=jnp.asarray(speeds, float),
+            behaviour=behaviour,
+            window=_padded_window(agent, horizon, pad),
+            horizon=horizon,
+        )
+
+    def draw(self, key: Array, shape: tuple[int, ...] = ()):
+        """The obstacle's controls, of the given shape."""
+        return self.behaviour.sample(key, shape)
+
+    def step(self, hazard: Vehicle, agent: Vehicle, noise) -> Vehicle:
+        """It drives on, regardless of the agent."""
+        return advance(hazard, noise, self.speeds)
+
+    def hits(self, agent: Vehicle, hazard: Vehicle) -> Array:
+        """Centres nearer than `distance`."""
+        squared = jnp.sum(jnp.square(hazard.position - agent.position), axis=-1)
+        return squared < jnp.square(self.distance)
+
+    def features(self, agent: Vehicle, hazard: Vehicle) -> Array:
+        """(6,) in the agent's frame: position (2), heading (cos, sin), its speed, the agent's."""
+        relative = to_ego(hazard.position - agent.position, agent.heading)
+        heading = to_ego(hazard.heading, agent.heading)
+        speeds = jnp.stack([hazard.speed, agent.speed])
+        return jnp.concatenate([relative, heading, speeds])
+
+    def mirrored(self, features: Array) -> Array:
+        """See `HazardSource`."""
+        return features * jnp.asarray([1.0, -1.0, 1.0, -1.0, 1.0, 1.0], features.dtype)
+
+    def sample(self, key: Array, agent: AgentModel) -> tuple[Vehicle, Vehicle]:
+        """See `HazardSource`."""
+        where, turn, own, other = jax.random.split(key, 4)
+        angle = jax.random.uniform(turn, (), float, -jnp.pi, jnp.pi)
+        position = _sample_relative(where, self.window)
+        hazard = make_vehicle(position, angle, _sample_speed(other, self.speeds))
+        return make_vehicle(jnp.zeros(2), 0.0, _sample_speed(own, agent.speeds)), hazard
+
+    def state_of(self, features: Array) -> tuple[Vehicle, Vehicle]:
+        """See `HazardSource`."""
+        hazard = Vehicle(position=features[:2], heading=features[2:4], speed=features[4])
+        return make_vehicle(jnp.zeros(2), 0.0, features[5]), hazard

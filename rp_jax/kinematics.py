@@ -1,0 +1,118 @@
+"""Vehicle dynamics: the only copy, shared by agents, moving obstacles, rollouts and adapters."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+
+class Control(struct.PyTreeNode):
+    """One command, or a table of commands along leading axes."""
+
+    acceleration: Array  # (...) room units / step^2
+    rotation: Array  # (..., 2) (cos, sin) of the turn; turns to the left are positive
+
+
+class Vehicle(struct.PyTreeNode):
+    """Pose and speed of a vehicle, unbatched or along leading axes."""
+
+    position: Array  # (..., 2) room units
+    heading: Array  # (..., 2) unit vector (cos, sin)
+    speed: Array  # (...) room units / step, negative when reversing
+
+
+class ControlDistribution(struct.PyTreeNode):
+    """A state-independent random policy over a table of controls (an open-loop eta^(o))."""
+
+    controls: Control  # (K,) table
+    probabilities: Array  # (K,) sums to one
+
+    def sample(self, key: Array, shape: tuple[int, ...] = ()) -> Control:
+        """Draws controls of the given shape, by inverting the cumulative distribution."""
+        uniform = jax.random.uniform(key, shape, self.probabilities.dtype)
+        edges = jnp.cumsum(self.probabilities)[:-1]
+        below = jnp.expand_dims(uniform, -1) >= jnp.broadcast_to(edges, (*shape, len(edges)))
+        index = jnp.sum(below, axis=-1)
+        return jax.tree.map(lambda table: table[index], self.controls)
+
+
+class AgentModel(struct.PyTreeNode):
+    """What the agent can do, and the baseline policy eta^(o) its threat is measured under."""
+
+    actions: Control  # (A,) table of discrete actions
+    baseline: ControlDistribution  # eta^(o), a function of the agent alone (Theorem 3)
+    speeds: Array  # (S,) the speeds reachable from rest, ascending; the ends are the limits
+
+    def step(self, vehicle: Vehicle, control: Control) -> Vehicle:
+        """The next state of the agent; unbatched in `vehicle` and `control`."""
+        return advance(vehicle, control, self.speeds)
+
+
+def make_vehicle(position, heading, speed) -> Vehicle:
+    """Builds a `Vehicle` from a position (..., 2), a heading angle (...) in radians and a speed."""
+    angle = jnp.asarray(heading, float)
+    return Vehicle(
+        position=jnp.asarray(position, float),
+        heading=jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1),
+        speed=jnp.asarray(speed, float),
+    )
+
+
+def control_table(accelerations: Sequence[float], turns: Sequence[float]) -> Control:
+    """All pairs of an acceleration and a turn (radians); index = i_acc * len(turns) + i_turn."""
+    acceleration = np.repeat(np.asarray(accelerations, float), len(turns))
+    turn = np.tile(np.asarray(turns, float), len(accelerations))
+    return Control(
+        acceleration=jnp.asarray(acceleration, float),
+        rotation=jnp.asarray(np.stack([np.cos(turn), np.sin(turn)], axis=-1), float),
+    )
+
+
+def independent_controls(
+    accelerations: Sequence[float],
+    acceleration_probabilities: Sequence[float],
+    turns: Sequence[float],
+    turn_probabilities: Sequence[float],
+) -> ControlDistribution:
+    """Acceleration and turn drawn independently of one another."""
+    joint = np.outer(acceleration_probabilities, turn_probabilities).reshape(-1)
+    return ControlDistribution(
+        controls=control_table(accelerations, turns), probabilities=jnp.asarray(joint, float)
+    )
+
+
+def rotate(vector: Array, rotation: Array) -> Array:
+    """Turns `vector` (..., 2) by the angle whose (cos, sin) is `rotation` (..., 2)."""
+    x, y = vector[..., 0], vector[..., 1]
+    c, s = rotation[..., 0], rotation[..., 1]
+    return jnp.stack([x * c - y * s, x * s + y * c], axis=-1)
+
+
+def to_ego(vector: Array, heading: Array) -> Array:
+    """Expresses a world vector (..., 2) in the frame whose x axis is `heading` (..., 2)."""
+    x, y = vector[..., 0], vector[..., 1]
+    c, s = heading[..., 0], heading[..., 1]
+    return jnp.stack([x * c + y * s, y * c - x * s], axis=-1)
+
+
+def angle_of(vector: Array) -> Array:
+    """The angle of `vector` (..., 2) in radians, in (-pi, pi]."""
+    return jnp.arctan2(vector[..., 1], vector[..., 0])
+
+
+def advance(vehicle: Vehicle, control: Control, speeds: Array) -> Vehicle:
+    """One step: move along the old heading at the old speed, then change speed and heading.
+
+    Args:
+        vehicle: the state before; unbatched or with leading axes that broadcast.
+        control: the command.
+        speeds: (S,) ascending; the new speed is clipped to its ends.
+    """
+    return Vehicle(
+        position=vehicle.position + vehicle.heading * vehicle.speed[..., None],
+        heading=rotate(vehicle.heading, control.rotation),
+        speed=jnp.clip(vehicle.speed + control.acceleration, speeds[0], speeds[-1]),
+    )

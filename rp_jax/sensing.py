@@ -1,0 +1,133 @@
+"""What a vehicle perceives of fixed points: neighbour look-up and LIDAR."""
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+from scipy.spatial import cKDTree
+
+from rp_jax.kinematics import to_ego
+
+FAR = 1e4  # coordinate of padding points, farther than anything asks for
+
+
+class PointGrid(struct.PyTreeNode):
+    """Fixed points sorted into the cells from which they can matter.
+
+    Each cell lists every point that can be within `radius` of a position in the cell (or, for
+    `nearest` grids, every point that can be the nearest one), so that a look-up is one gather.
+    """
+
+    origin: Array  # (2,) corner of the grid, room units
+    cell: Array  # () width of a cell
+    points: Array  # (nx, ny, C, 2) candidates of each cell, padded by FAR
+    index: Array  # (nx, ny, C) int32, their index in the original list; padding has -1
+
+    def _cell_of(self, position: Array) -> tuple[Array, Array]:
+        cell = jnp.floor((position - self.origin) / self.cell).astype(jnp.int32)
+        nx, ny = self.points.shape[:2]
+        return jnp.clip(cell[0], 0, nx - 1), jnp.clip(cell[1], 0, ny - 1)
+
+    def near(self, position: Array) -> Array:
+        """Candidates (C, 2) around `position` (2,). Callers still test the distance."""
+        return self.points[self._cell_of(position)]
+
+    def nearest(self, position: Array) -> Array:
+        """Index of the point nearest to `position` (2,); the first of equals."""
+        i, j = self._cell_of(position)
+        squared = jnp.sum(jnp.square(self.points[i, j] - position[None]), axis=-1)
+        return self.index[i, j, jnp.argmin(squared)]
+
+
+def _cells(points: np.ndarray, cell: float, margin: float):
+    origin = points.min(axis=0) - margin
+    shape = np.maximum(np.ceil((points.max(axis=0) + margin - origin) / cell).astype(int), 1)
+    ij = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
+    return origin, shape, origin + (ij.reshape(-1, 2) + 0.5) * cell
+
+
+def _pack(points, cell, origin, shape, members) -> PointGrid:
+    width = max(1, max(len(m) for m in members))
+    table = np.full((len(members), width, 2), FAR)
+    index = np.full((len(members), width), -1, np.int32)
+    for row, member in enumerate(members):
+        index[row, : len(member)] = np.sort(member)
+        table[row, : len(member)] = points[index[row, : len(member)]]
+    return PointGrid(
+        origin=jnp.asarray(origin, float),
+        cell=jnp.asarray(cell, float),
+        points=jnp.asarray(table.reshape(*shape, width, 2), float),
+        index=jnp.asarray(index.reshape(*shape, width)),
+    )
+
+
+def points_within(points: np.ndarray, radius: float, cell: float) -> PointGrid:
+    """A grid that finds all of `points` (P, 2) within `radius`, from anywhere in the plane."""
+    points = np.asarray(points, float)
+    origin, shape, centres = _cells(points, cell, radius)
+    reach = radius + cell * np.sqrt(0.5) + 1e-6
+    return _pack(points, cell, origin, shape, cKDTree(points).query_ball_point(centres, reach))
+
+
+def nearest_of(points: np.ndarray, margin: float, cell: float) -> PointGrid:
+    """A grid that finds the nearest of `points` (P, 2).
+
+    Exact up to `margin` from the points; farther off, it is the one nearest to the cell's centre.
+    """
+    points = np.asarray(points, float)
+    origin, shape, centres = _cells(points, cell, margin + cell)
+    tree = cKDTree(points)
+    diagonal = cell * np.sqrt(2)
+    distance, nearest = tree.query(centres)
+    # Between the cell's centre and any position in it, distances differ by half a diagonal.
+    members = tree.query_ball_point(centres, distance + diagonal + 1e-6)
+    exact = distance <= margin + diagonal / 2
+    lists = [m if ok else [n] for m, ok, n in zip(members, exact, nearest, strict=True)]
+    return _pack(points, cell, origin, shape, lists)
+
+
+def bin_edges(bins: int) -> Array:
+    """Directions (bins + 1, 2) of the edges of equal angular bins, from -pi to pi."""
+    angle = np.arange(bins + 1) * (2 * np.pi / bins) - np.pi
+    return jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=-1), float)
+
+
+def _approximate_angle(x: Array, y: Array) -> Array:
+    """Polynomial arctan2, off by at most 2e-6 rad; many times faster than the library's."""
+    ax, ay = jnp.abs(x), jnp.abs(y)
+    z = jnp.minimum(ax, ay) / jnp.maximum(jnp.maximum(ax, ay), 1e-30)
+    s = z * z
+    p = -0.33262347 + s * (0.19354346 + s * (-0.11643287 + s * (0.05265332 - s * 0.01172120)))
+    p = z * (0.99997726 + s * p)
+    p = jnp.where(ay > ax, jnp.pi / 2 - p, p)
+    p = jnp.where(x < 0, jnp.pi - p, p)
+    return jnp.where(y < 0, -p, p)
+
+
+def lidar(points: Array, position: Array, heading: Array, edges: Array, view: float = 1.0) -> Array:
+    """Distance of the nearest point in each angular bin around the heading.
+
+    Args:
+        points: (P, 2) world coordinates.
+        position: (2,) of the sensor.
+        heading: (2,) unit vector; bin k spans the angles between edges k and k + 1 from it.
+        edges: (bins + 1, 2) from `bin_edges`. Bins are open: a point on an edge is not seen.
+        view: points at this distance or farther are not seen.
+
+    Returns:
+        (bins,) distances, 0 where nothing is seen.
+    """
+    bins = edges.shape[0] - 1
+    local = to_ego(points - position[None], heading)
+    x, y = local[:, 0], local[:, 1]
+    # The nearest edge comes from the approximate angle, the side of it from the exact vectors.
+    turn = (_approximate_angle(x, y) + jnp.pi) * (bins / (2 * jnp.pi))
+    nearest = jnp.clip(jnp.round(turn).astype(jnp.int32), 0, bins)
+    edge = edges[nearest]
+    cross = edge[:, 0] * y - edge[:, 1] * x
+    k = jnp.where(cross > 0, nearest, nearest - 1) % bins
+    squared = x * x + y * y
+    seen = (squared < view * view) & (cross != 0)
+    best = jnp.full(bins, jnp.inf, squared.dtype)
+    best = best.at[k].min(jnp.where(seen, squared, jnp.inf), mode="promise_in_bounds")
+    return jnp.where(jnp.isinf(best), 0.0, jnp.sqrt(best))
