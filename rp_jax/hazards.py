@@ -15,6 +15,7 @@ from rp_jax.kinematics import (
     advance,
     angle_of,
     make_vehicle,
+    squared_distance,
     to_ego,
 )
 
@@ -62,8 +63,10 @@ class Window(struct.PyTreeNode):
     upper: Array  # (2,)
 
     def contains(self, relative: Array) -> Array:
-        """() bool for a relative position (2,)."""
-        return jnp.all((relative >= self.lower) & (relative <= self.upper), axis=-1)
+        """(...) bool for relative positions (..., 2)."""
+        x, y = relative[..., 0], relative[..., 1]
+        along = (x >= self.lower[0]) & (x <= self.upper[0])
+        return along & (y >= self.lower[1]) & (y <= self.upper[1])
 
 
 class SubRMDP(struct.PyTreeNode):
@@ -133,7 +136,7 @@ class WallPoint(struct.PyTreeNode):
 
     def hits(self, agent: Vehicle, hazard: Array) -> Array:
         """Nearer than `radius`."""
-        return jnp.sum(jnp.square(hazard - agent.position), axis=-1) < jnp.square(self.radius)
+        return squared_distance(hazard, agent.position) < jnp.square(self.radius)
 
     def features(self, agent: Vehicle, hazard: Array) -> Array:
         """(3,) position in the agent's frame (2), the agent's speed."""
@@ -193,8 +196,7 @@ class MovingObstacle(struct.PyTreeNode):
 
     def hits(self, agent: Vehicle, hazard: Vehicle) -> Array:
         """Centres nearer than `distance`."""
-        squared = jnp.sum(jnp.square(hazard.position - agent.position), axis=-1)
-        return squared < jnp.square(self.distance)
+        return squared_distance(hazard.position, agent.position) < jnp.square(self.distance)
 
     def features(self, agent: Vehicle, hazard: Vehicle) -> Array:
         """(6,) in the agent's frame: position (2), heading (cos, sin), its speed, the agent's."""

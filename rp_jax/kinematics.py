@@ -45,6 +45,8 @@ class AgentModel(struct.PyTreeNode):
     actions: Control  # (A,) table of discrete actions
     baseline: ControlDistribution  # eta^(o), a function of the agent alone (Theorem 3)
     speeds: Array  # (S,) the speeds reachable from rest, ascending; the ends are the limits
+    delayed: bool = struct.field(pytree_node=False, default=True)  # a control moves the agent
+    # only one step later, as in `advance`: exact enumeration may then skip the last control
 
     def step(self, vehicle: Vehicle, control: Control) -> Vehicle:
         """The next state of the agent; unbatched in `vehicle` and `control`."""
@@ -84,6 +86,20 @@ def independent_controls(
     )
 
 
+def mirrored_actions(actions: Control) -> np.ndarray:
+    """(A,) index of each action's left-right mirror image.
+
+    Raises:
+        ValueError: the table of actions has no such symmetry.
+    """
+    acceleration, rotation = np.asarray(actions.acceleration), np.asarray(actions.rotation)
+    table = np.concatenate([acceleration[:, None], rotation], axis=-1)
+    gap = np.abs(table[:, None] - table[None] * np.asarray([1, 1, -1])).max(axis=-1)
+    if (gap.min(axis=-1) > 1e-6).any():
+        raise ValueError("actions: the table holds no mirror image of some of its actions")
+    return gap.argmin(axis=-1)
+
+
 def rotate(vector: Array, rotation: Array) -> Array:
     """Turns `vector` (..., 2) by the angle whose (cos, sin) is `rotation` (..., 2)."""
     x, y = vector[..., 0], vector[..., 1]
@@ -96,6 +112,12 @@ def to_ego(vector: Array, heading: Array) -> Array:
     x, y = vector[..., 0], vector[..., 1]
     c, s = heading[..., 0], heading[..., 1]
     return jnp.stack([x * c + y * s, y * c - x * s], axis=-1)
+
+
+def squared_distance(a: Array, b: Array) -> Array:
+    """Squared distance (...) of two positions (..., 2)."""
+    x, y = a[..., 0] - b[..., 0], a[..., 1] - b[..., 1]
+    return x * x + y * y
 
 
 def angle_of(vector: Array) -> Array:

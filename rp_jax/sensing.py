@@ -6,7 +6,7 @@ from flax import struct
 from jax import Array
 from scipy.spatial import cKDTree
 
-from rp_jax.kinematics import to_ego
+from rp_jax.kinematics import squared_distance, to_ego
 
 FAR = 1e4  # coordinate of padding points, farther than anything asks for
 
@@ -35,7 +35,7 @@ class PointGrid(struct.PyTreeNode):
     def nearest(self, position: Array) -> Array:
         """Index of the point nearest to `position` (2,); the first of equals."""
         i, j = self._cell_of(position)
-        squared = jnp.sum(jnp.square(self.points[i, j] - position[None]), axis=-1)
+        squared = squared_distance(self.points[i, j], position[None])
         return self.index[i, j, jnp.argmin(squared)]
 
 

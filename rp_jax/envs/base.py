@@ -1,5 +1,6 @@
 """What every environment is: pure functions on frozen states, and one automatic reset."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -38,6 +39,8 @@ class Env(Protocol):
     A `State` has the fields `agent` and `time`. `Params` are pytrees: sweep them by `vmap`.
     """
 
+    LIDAR_BINS: int  # how many of an observation's first values are a LIDAR's distances
+
     def reset(self, key: Array, params: Any) -> Any:
         """Draws a start state. Any other state of the same type can be stepped as well."""
 
@@ -70,15 +73,54 @@ def select(condition: Array, yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
+def renew(where: Array, rows: Any, make: Callable[[Array], Any], chunk: int = 16) -> Any:
+    """Replaces the rows of a batch that are marked, computing only those.
+
+    Args:
+        where: (B,) bool, the rows to replace.
+        rows: pytree with leading axis (B,).
+        make: maps indices (chunk,) to new rows with leading axis (chunk,). It is called as often
+            as there are marked rows to make; an index of B marks a spare place.
+        chunk: rows made at a time.
+    """
+    batch = where.shape[0]
+    size = -(-batch // chunk) * chunk
+    rank = jnp.cumsum(where.astype(jnp.int32))
+    slot = jnp.where(where, rank - 1, size)
+    order = jnp.full(size, batch, jnp.int32)
+    order = order.at[slot].set(jnp.arange(batch, dtype=jnp.int32), mode="drop")
+
+    def some(carry):
+        start, rows = carry
+        indices = jax.lax.dynamic_slice(order, (start,), (chunk,))
+        new = make(indices)
+        rows = jax.tree.map(lambda old, now: old.at[indices].set(now, mode="drop"), rows, new)
+        return start + chunk, rows
+
+    return jax.lax.while_loop(lambda c: c[0] < rank[-1], some, (0, rows))[1]
+
+
 def auto_reset_step(
-    env: Env, key: Array, state: Any, action: Array, params: Any
+    env: Env, keys: Array, states: Any, actions: Array, params: Any
 ) -> tuple[Any, Any, Outcome]:
-    """A step that starts a fresh episode wherever one has ended.
+    """A step of a batch that draws a fresh start wherever an episode has ended.
+
+    Args:
+        env: the environment.
+        keys: (B,) one per row; no row depends on another.
+        states: leading axis (B,).
+        actions: (B,) int.
+        params: of the environment, unbatched.
 
     Returns:
-        (carried, reached, outcome): `carried` is the state to go on from (a newly drawn start
-        after an end); `reached` is the state the step led to, the terminal one included.
+        (carried, reached, outcome): `carried` are the states to go on from, newly drawn after an
+        end; `reached` are the states the step led to, terminal ones included.
     """
-    step_key, reset_key = jax.random.split(key)
-    reached, outcome = env.step(step_key, state, action, params)
-    return select(outcome.done, env.reset(reset_key, params), reached), reached, outcome
+    both = jax.vmap(jax.random.split)(keys)
+    step = jax.vmap(env.step, (0, 0, 0, None))
+    reached, outcome = step(both[:, 0], states, actions, params)
+
+    def starts(rows: Array) -> Any:
+        return jax.vmap(env.reset, (0, None))(both.at[rows, 1].get(mode="clip"), params)
+
+    return renew(outcome.done, reached, starts), reached, outcome

@@ -17,7 +17,7 @@ from rp_jax.kinematics import (
     control_table,
     independent_controls,
     make_vehicle,
-    rotate,
+    squared_distance,
     to_ego,
 )
 from rp_jax.validate import number, one_of, positive
@@ -113,7 +113,7 @@ def make_params(
         ValueError: a value is out of range.
     """
     one_of("fidelity", fidelity, FIDELITIES)
-    number("num_obstacles", num_obstacles, least=0, most=MOST_OBSTACLES, integer=True)
+    number("num_obstacles", num_obstacles, least=1, most=MOST_OBSTACLES, integer=True)
     positive("time_limit", time_limit, integer=True)
     positive("radius", radius, most=0.2)
     positive("beta", beta, most=1.0)
@@ -155,7 +155,7 @@ def make_params(
 
 
 def _progress(agent: Vehicle, params: Params) -> Array:
-    progress = -20 * jnp.sqrt(jnp.sum(jnp.square(params.goal - agent.position)))
+    progress = -20 * jnp.sqrt(squared_distance(params.goal, agent.position))
     return jnp.round(progress) if params.fidelity == "released" else progress
 
 
@@ -170,45 +170,41 @@ def start_at(agent: Vehicle, obstacles: Vehicle, params: Params) -> State:
     )
 
 
-def _appear(key: Array, agent: Vehicle, params: Params, needed: Array) -> Vehicle:
-    """An obstacle anywhere in the room, CLEARANCE away from the agent, by rejection.
+def _anywhere(key: Array, params: Params) -> Vehicle:
+    """An obstacle anywhere in the room, with any heading and any of its speeds."""
+    speeds = params.obstacle.speeds
+    uniform = jax.random.uniform(key, (4,), speeds.dtype)
+    return make_vehicle(
+        params.radius + uniform[:2] * (ROOM - 2 * params.radius),
+        (2 * uniform[2] - 1) * jnp.pi,
+        speeds[(uniform[3] * len(speeds)).astype(jnp.int32)],
+    )
 
-    Where it is not `needed`, the first draw is good enough.
+
+def _appear(key: Array, agent: Vehicle, needed: Array, params: Params) -> Vehicle:
+    """Places (N,) the obstacles that are `needed` (N,) CLEARANCE away from the agent.
+
+    By rejection, one after another: few are needed at a time, and obstacle n's place does not
+    depend on how many come after it. Rows that are not needed hold nothing of use.
     """
 
-    def draw(carry):
-        attempt, _ = carry
-        low, high = params.radius, ROOM - params.radius
-        return attempt + 1, jax.random.uniform(
-            jax.random.fold_in(key, attempt), (2,), low.dtype, low, high
-        )
+    def attempt(carry):
+        count, left, placed = carry
+        place = _anywhere(jax.random.fold_in(key, count), params)
+        free = squared_distance(place.position, agent.position) >= CLEARANCE**2
+        now = (jnp.arange(len(left)) == jnp.argmax(left)) & free
+        placed = jax.vmap(base.select, (0, None, 0))(now, place, placed)
+        return count + 1, left & ~now, placed
 
-    def rejected(carry):
-        near = jnp.sum(jnp.square(carry[1] - agent.position)) < CLEARANCE**2
-        return near & needed
-
-    speeds = params.obstacle.speeds
-    _, position = jax.lax.while_loop(rejected, draw, draw((jnp.asarray(0), None)))
-    turn, pick = jax.random.split(jax.random.fold_in(key, -1))
-    angle = jax.random.uniform(turn, (), low_dtype(params), -jnp.pi, jnp.pi)
-    return make_vehicle(position, angle, jax.random.choice(pick, speeds))
-
-
-def low_dtype(params: Params):
-    """The floating-point type of the parameters."""
-    return params.radius.dtype
-
-
-def _obstacle_keys(key: Array, count: int) -> Array:
-    """Obstacle n's key depends on n alone: it evolves alike among 1, 3 or 15."""
-    return jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(count))
+    count = needed.shape[0]
+    blank = jax.tree.map(lambda a: jnp.zeros((count, *a.shape), a.dtype), agent)
+    return jax.lax.while_loop(lambda c: jnp.any(c[1]), attempt, (0, needed, blank))[2]
 
 
 def reset(key: Array, params: Params) -> State:
     """The agent in its corner, the obstacles anywhere at least CLEARANCE away from it."""
-    keys = _obstacle_keys(key, params.num_obstacles)
-    appear = jax.vmap(_appear, (0, None, None, None))
-    return start_at(params.start, appear(keys, params.start, params, jnp.asarray(True)), params)
+    needed = jnp.ones(params.num_obstacles, bool)
+    return start_at(params.start, _appear(key, params.start, needed, params), params)
 
 
 def _out_of_place(position: Array, params: Params) -> Array:
@@ -226,14 +222,13 @@ def _out_of_place(position: Array, params: Params) -> Array:
 
 def draw(key: Array, state: State, action: Array, params: Params) -> Draws:
     """The random numbers of the step from `state` under `action`."""
-    keys = jax.vmap(jax.random.split)(_obstacle_keys(key, params.num_obstacles))
-    controls = jax.vmap(params.obstacle.draw)(keys[:, 0])
+    drive, place = jax.random.split(key)
+    controls = params.obstacle.draw(drive, state.present.shape)
     # Obstacles appear away from where the agent will be.
     agent = _move_agent(state, action, params)
     moved = _move_obstacles(state, controls, params)
     needed = jax.vmap(_out_of_place, (0, None))(moved.position, params)
-    relocated = jax.vmap(_appear, (0, None, None, 0))(keys[:, 1], agent, params, needed)
-    return Draws(controls=controls, relocated=relocated)
+    return Draws(controls=controls, relocated=_appear(place, agent, needed, params))
 
 
 def _move_agent(state: State, action: Array, params: Params) -> Vehicle:

@@ -1,0 +1,128 @@
+"""Evaluation: thousands of episodes in one jitted call, each from its own key."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+from jax import Array
+
+from rp_jax import shield, statistics
+from rp_jax.envs.base import select
+from rp_jax.planning.pmdp import PMDP, Percept
+
+# (key, states, percept) -> actions (B,) int; keys and states have a leading axis (B,).
+Policy = Callable[[Array, Any, Percept], Array]
+
+
+class Episodes(NamedTuple):
+    """One row per episode."""
+
+    score: Array  # reward, without penalty
+    danger: Array  # 1 for a crash
+    goal: Array  # bool
+    length: Array  # steps
+    interventions: Array  # steps on which the mask changed the policy's own choice
+    insecure: Array  # steps without an admissible action
+    causes: dict[str, Array]  # bool, what was being hit at the end
+
+
+def greedy(network: nn.Module, weights: Any) -> Callable[[Percept], Array]:
+    """Action values of a learned Q-network, (B, A)."""
+    return lambda percept: network.apply(weights, percept.encoded)
+
+
+def run_episodes(
+    key: Array,
+    pmdp: PMDP,
+    values: Callable[[Percept], Array],
+    episodes: int,
+    *,
+    batch: int = 1000,
+    start: Callable[[Array, Any], Any] | None = None,
+) -> Episodes:
+    """Acts greedily inside the admissible set until each episode ends.
+
+    Args:
+        key: its episodes are independent of every other key's.
+        pmdp: the environment, the threats and the threshold.
+        values: scores the actions of a batch of states; any policy can be written so.
+        episodes: how many.
+        batch: episodes simulated side by side.
+        start: draws a start state from (key, params); the environment's reset if not given.
+
+    Returns:
+        Rows with leading axis (episodes,).
+    """
+    reset = start if start is not None else pmdp.env.reset
+    rounds = -(-episodes // batch)
+
+    def one_round(key: Array) -> Episodes:
+        keys = jax.random.split(key, batch)
+        states = jax.vmap(reset, (0, None))(keys, pmdp.params)
+        zeros = jnp.zeros(batch, pmdp.x.dtype)
+        none = jnp.zeros(batch, bool)
+        causes = {kind: none for kind in pmdp.env.sub_rmdps(pmdp.params)}
+        count = jnp.zeros(batch, jnp.int32)
+        rows = Episodes(zeros, zeros, none, count, count, count, causes)
+
+        def advance(carry):
+            t, alive, states, rows = carry
+            percept = pmdp.perceive(states, alive)
+            scores = values(percept)
+            wish = jnp.argmax(scores, axis=-1)
+            action = jax.vmap(shield.masked_argmax)(scores, percept.admissible)
+            step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, t)
+            step = jax.vmap(pmdp.env.step, (0, 0, 0, None))
+            reached, outcome = step(step_keys, states, action, pmdp.params)
+            hit = jax.vmap(pmdp.env.causes, (0, None))(reached, pmdp.params)
+            new = Episodes(
+                score=rows.score + outcome.reward,
+                danger=rows.danger + outcome.danger,
+                goal=outcome.goal,
+                length=rows.length + 1,
+                interventions=rows.interventions + (wish != action),
+                insecure=rows.insecure + ~percept.secure,
+                causes=hit,
+            )
+            rows = jax.vmap(select)(alive, new, rows)
+            return t + 1, alive & ~outcome.done, reached, rows
+
+        carry = (jnp.asarray(0), jnp.ones(batch, bool), states, rows)
+        return jax.lax.while_loop(lambda c: jnp.any(c[1]), advance, carry)[3]
+
+    rows = jax.lax.map(one_round, jax.random.split(key, rounds))
+    return jax.tree.map(lambda a: a.reshape(-1)[:episodes], rows)
+
+
+def summarise(rows: Episodes, penalty: float) -> dict[str, Any]:
+    """What is reported of some episodes; returns are over all of them, penalty included.
+
+    Args:
+        rows: arrays (n,).
+        penalty: taken off the return of an episode per unit of danger.
+    """
+    rows = jax.tree.map(np.asarray, rows)
+    n, k = rows.score.size, int((rows.danger > 0).sum())
+    returns = rows.score - penalty * rows.danger
+    mean, width = statistics.mean_interval(returns)
+    steps = int(rows.length.sum())
+    safe = rows.danger == 0
+    low, high = statistics.clopper_pearson(k, n)
+    return {
+        "episodes": n,
+        "return_mean": mean,
+        "return_ci95": width,
+        "uncrashed_return_mean": float(rows.score[safe].mean()) if safe.any() else float("nan"),
+        "crashes": k,
+        "crash_rate": k / n,
+        "crash_lower95": low,
+        "crash_upper95": high,
+        "goal_rate": float(rows.goal.mean()),
+        "interventions": float(rows.interventions.sum() / steps),
+        "insecure": float(rows.insecure.sum() / steps),
+        "steps": steps,
+        "causes": {kind: int((hit & ~safe).sum()) for kind, hit in rows.causes.items()},
+    }

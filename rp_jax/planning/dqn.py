@@ -1,0 +1,112 @@
+"""Masked Double DQN: Algorithm 4 with a network for Q."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import linen as nn
+from flax import struct
+from jax import Array
+
+from rp_jax import shield
+from rp_jax.planning.pmdp import Encoded
+
+
+class Transition(NamedTuple):
+    """One item of the replay: n steps from a state, and what is admissible where they led."""
+
+    encoded: Encoded
+    action: Array  # () int32
+    reward: Array  # () discounted sum over the n steps
+    discount: Array  # () gamma^n, 0 after a true end
+    next_encoded: Encoded
+    next_admissible: Array  # () int32, `shield.to_bits`
+
+
+class DQNConfig(struct.PyTreeNode):
+    """Hyperparameters of the learner."""
+
+    gamma: float = struct.field(pytree_node=False, default=0.95)
+    learning_rate: float = struct.field(pytree_node=False, default=1e-3)
+    epsilon: float = struct.field(pytree_node=False, default=1e-8)  # Adam's
+    anneal: bool = struct.field(pytree_node=False, default=True)  # learning rate falls to a tenth
+    polyak: float = struct.field(pytree_node=False, default=0.01)  # 0: copy every `period`
+    period: int = struct.field(pytree_node=False, default=1000)  # updates between copies
+    reward_scale: float = struct.field(pytree_node=False, default=1.0)
+    total_updates: int = struct.field(pytree_node=False, default=10_000)
+
+
+class Learner(NamedTuple):
+    """Carried through learning."""
+
+    params: Any
+    target: Any
+    opt_state: optax.OptState
+    updates: Array  # () int32
+
+
+def double_q_target(
+    reward: Array, discount: Array, online: Array, target: Array, admissible: Array
+) -> Array:
+    """() r + gamma Q'(s', argmax_{a' in A(s')} Q(s', a')): Algorithm 4, lines 5 to 10.
+
+    Args:
+        reward: () of the step(s) to s'.
+        discount: () 0 where s' is terminal.
+        online: (A,) Q(s', .) that chooses.
+        target: (A,) Q'(s', .) that values.
+        admissible: (A,) bool; greedy-eta alone where s' is not secure.
+    """
+    return reward + discount * target[shield.masked_argmax(online, admissible)]
+
+
+def optimiser(config: DQNConfig) -> optax.GradientTransformation:
+    """Adam."""
+    rate = config.learning_rate
+    schedule = optax.cosine_decay_schedule(rate, config.total_updates, alpha=0.1)
+    return optax.adam(schedule if config.anneal else rate, eps=config.epsilon)
+
+
+def init(key: Array, network: nn.Module, encoded: Encoded, config: DQNConfig) -> Learner:
+    """A fresh learner; `encoded` is any example."""
+    params = network.init(key, encoded)
+    target = jax.tree.map(jnp.copy, params)
+    return Learner(params, target, optimiser(config).init(params), jnp.asarray(0, jnp.int32))
+
+
+def update(
+    learner: Learner, network: Any, batch: Transition, weights: Array, config: DQNConfig
+) -> tuple[Learner, Array, Array]:
+    """One gradient step.
+
+    Args:
+        learner: before the step.
+        network: maps (params, Encoded) to action values.
+        batch: transitions with leading axis (B,).
+        weights: (B,) of the samples, 1 unless the replay is prioritised.
+        config: hyperparameters.
+
+    Returns:
+        (learner, loss, errors): the mean Huber loss and the temporal-difference errors (B,).
+    """
+    online = network.apply(learner.params, batch.next_encoded)
+    target = network.apply(learner.target, batch.next_encoded)
+    admissible = jax.vmap(shield.from_bits, (0, None))(batch.next_admissible, online.shape[-1])
+    reward = batch.reward * config.reward_scale
+    goal = jax.vmap(double_q_target)(reward, batch.discount, online, target, admissible)
+
+    def loss(params):
+        values = network.apply(params, batch.encoded)
+        chosen = jnp.take_along_axis(values, batch.action[:, None], axis=-1)[:, 0]
+        return jnp.mean(weights * optax.huber_loss(chosen, goal)), chosen - goal
+
+    (value, errors), grads = jax.value_and_grad(loss, has_aux=True)(learner.params)
+    updates, opt_state = optimiser(config).update(grads, learner.opt_state, learner.params)
+    params = optax.apply_updates(learner.params, updates)
+    count = learner.updates + 1
+    if config.polyak > 0:
+        moved = optax.incremental_update(params, learner.target, config.polyak)
+    else:
+        moved = optax.periodic_update(params, learner.target, count, config.period)
+    return Learner(params, moved, opt_state, count), value, errors

@@ -1,0 +1,288 @@
+"""The training loop: acting, threat, replay and learning in one jitted chunk."""
+
+from typing import Any, NamedTuple
+
+import flashbax
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from flax import struct
+from jax import Array
+
+from rp_jax import shield
+from rp_jax.envs import base
+from rp_jax.planning import dqn
+from rp_jax.planning.dqn import DQNConfig, Learner, Transition
+from rp_jax.planning.networks import NETWORKS
+from rp_jax.planning.pmdp import PMDP, Encoded
+
+
+class LoopConfig(struct.PyTreeNode):
+    """Sizes and schedules of the loop."""
+
+    network: str = struct.field(pytree_node=False, default="tuned")
+    learner: DQNConfig = struct.field(pytree_node=False, default=DQNConfig())
+    steps: int = struct.field(pytree_node=False, default=600_000)  # agent steps in all
+    num_envs: int = struct.field(pytree_node=False, default=256)
+    batch: int = struct.field(pytree_node=False, default=1024)
+    updates: int = struct.field(pytree_node=False, default=1)  # per step of all environments
+    n_step: int = struct.field(pytree_node=False, default=3)
+    replay: int = struct.field(pytree_node=False, default=200_000)  # transitions kept
+    replay_start: int = struct.field(pytree_node=False, default=5_000)
+    prioritised: bool = struct.field(pytree_node=False, default=False)
+    priority_exponent: float = struct.field(pytree_node=False, default=0.6)
+    importance: float = struct.field(pytree_node=False, default=0.4)  # rises to 1 at the end
+    explore_from: float = struct.field(pytree_node=False, default=1.0)
+    explore_to: float = struct.field(pytree_node=False, default=0.05)
+    explore_share: float = struct.field(pytree_node=False, default=0.5)  # of the steps, linear
+
+    @property
+    def iterations(self) -> int:
+        """Steps of all environments at once."""
+        return self.steps // self.num_envs
+
+    @property
+    def samples_per_step(self) -> float:
+        """Replayed transitions per agent step."""
+        return self.batch * self.updates / self.num_envs
+
+
+class Taken(NamedTuple):
+    """One step of every environment, as the n-step window keeps it."""
+
+    encoded: Encoded
+    action: Array  # (B,)
+    reward: Array  # (B,) penalty included
+    terminated: Array  # (B,)
+    done: Array  # (B,)
+    next_encoded: Encoded
+    next_admissible: Array  # (B,) bits
+
+
+class Metrics(NamedTuple):
+    """Sums over a chunk of iterations; divide by `episodes` or `steps`."""
+
+    steps: Array
+    episodes: Array
+    score: Array  # of the finished episodes, without penalty
+    crashes: Array
+    goals: Array
+    insecure: Array  # states without an admissible action
+    inadmissible: Array  # actions taken whose threat exceeds x though others' did not
+    loss: Array
+
+
+class LoopState(NamedTuple):
+    """Carried through training."""
+
+    states: Any  # (B,) environment states
+    encoded: Encoded  # (B,) of those states
+    threat: Array  # (B, A)
+    bits: Array  # (B,) admissible actions
+    score: Array  # (B,) reward of the running episodes
+    window: Taken  # (n_step, B), oldest first
+    learner: Learner
+    replay: Any
+    key: Array
+    iteration: Array  # ()
+
+
+def make_network(config: LoopConfig, num_actions: int) -> nn.Module:
+    """The Q-network that the configuration names."""
+    return NETWORKS[config.network](num_actions=num_actions)
+
+
+def make_replay(config: LoopConfig) -> Any:
+    """A flashbax buffer of single transitions, uniform or prioritised."""
+    sizes = {
+        "max_length": config.replay,
+        "min_length": max(config.replay_start, config.num_envs),
+        "sample_batch_size": config.batch,
+        "add_batches": True,
+    }
+    if config.prioritised:
+        exponent = config.priority_exponent
+        return flashbax.make_prioritised_item_buffer(priority_exponent=exponent, **sizes)
+    return flashbax.make_item_buffer(**sizes)
+
+
+def n_step_transition(window: Taken, gamma: float) -> Transition:
+    """The transition from the window's first step to its last, or to the first end in it.
+
+    `window` is of a single environment: leading axis (n,).
+    """
+    n = window.reward.shape[0]
+    before = jnp.cumsum(window.done) - window.done == 0  # no end before this step
+    last = jnp.sum(before) - 1
+    powers = gamma ** jnp.arange(n)
+    at = lambda tree, i: jax.tree.map(lambda a: a[i], tree)  # noqa: E731
+    return Transition(
+        encoded=at(window.encoded, 0),
+        action=window.action[0],
+        reward=jnp.sum(jnp.where(before, powers * window.reward, 0.0)),
+        discount=jnp.where(window.terminated[last], 0.0, gamma * powers[last]),
+        next_encoded=at(window.next_encoded, last),
+        next_admissible=window.next_admissible[last],
+    )
+
+
+def exploration(iteration: Array, config: LoopConfig) -> Array:
+    """() epsilon, falling linearly."""
+    span = max(1.0, config.explore_share * config.iterations)
+    done = jnp.minimum(iteration / span, 1.0)
+    return config.explore_from + done * (config.explore_to - config.explore_from)
+
+
+def _choose(key: Array, values: Array, bits: Array, epsilon: Array) -> Array:
+    """() int32, epsilon-greedy inside the admissible set."""
+    explore, pick = jax.random.split(key)
+    mask = shield.from_bits(bits, values.shape[-1])
+    greedy = shield.masked_argmax(values, mask)
+    random = shield.masked_sample(pick, mask)
+    action = jnp.where(jax.random.bernoulli(explore, epsilon), random, greedy)
+    return action.astype(jnp.int32)
+
+
+def _look(pmdp: PMDP, states: Any) -> tuple[Encoded, Array, Array]:
+    """(encoded, threat, bits) of a batch of states."""
+    percept = pmdp.perceive(states)
+    return percept.encoded, percept.threat, jax.vmap(shield.to_bits)(percept.admissible)
+
+
+def interact(
+    key: Array, state: LoopState, pmdp: PMDP, network: nn.Module, config: LoopConfig
+) -> tuple[LoopState, Metrics]:
+    """Every environment takes one step; the window moves on; nothing is learned."""
+    choose_key, step_key, reset_key = jax.random.split(key, 3)
+    batch = config.num_envs
+    values = network.apply(state.learner.params, state.encoded)
+    epsilon = exploration(state.iteration, config)
+    keys = jax.random.split(choose_key, batch)
+    action = jax.vmap(_choose, (0, 0, 0, None))(keys, values, state.bits, epsilon)
+    step = jax.vmap(pmdp.env.step, (0, 0, 0, None))
+    reached, outcome = step(jax.random.split(step_key, batch), state.states, action, pmdp.params)
+    encoded, threat, bits = _look(pmdp, reached)
+    taken = Taken(
+        encoded=state.encoded,
+        action=action,
+        reward=outcome.reward - pmdp.penalty * outcome.danger,
+        terminated=outcome.terminated,
+        done=outcome.done,
+        next_encoded=encoded,
+        next_admissible=bits,
+    )
+    # Fresh starts, and looking at them, only where an episode has ended.
+    reset_keys = jax.random.split(reset_key, batch)
+
+    def starts(rows: Array):
+        fresh_keys = reset_keys.at[rows].get(mode="clip")
+        fresh = jax.vmap(pmdp.env.reset, (0, None))(fresh_keys, pmdp.params)
+        return fresh, *_look(pmdp, fresh)
+
+    carried = base.renew(outcome.done, (reached, encoded, threat, bits), starts)
+    score = state.score + outcome.reward
+    metrics = Metrics(
+        steps=jnp.asarray(batch, score.dtype),
+        episodes=jnp.sum(outcome.done, dtype=score.dtype),
+        score=jnp.sum(jnp.where(outcome.done, score, 0.0)),
+        crashes=jnp.sum(outcome.danger),
+        goals=jnp.sum(outcome.goal, dtype=score.dtype),
+        insecure=jnp.sum(jnp.min(state.threat, axis=-1) > pmdp.x, dtype=score.dtype),
+        inadmissible=jnp.sum(_inadmissible(state.threat, action, pmdp.x), dtype=score.dtype),
+        loss=jnp.zeros((), score.dtype),
+    )
+    window = jax.tree.map(
+        lambda old, new: jnp.concatenate([old[1:], new[None]]), state.window, taken
+    )
+    state = state._replace(
+        states=carried[0],
+        encoded=carried[1],
+        threat=carried[2],
+        bits=carried[3],
+        score=jnp.where(outcome.done, 0.0, score),
+        window=window,
+    )
+    return state, metrics
+
+
+def _inadmissible(threat: Array, action: Array, x: Array) -> Array:
+    """(B,) bool, checked against the threats themselves and not against the mask."""
+    taken = jnp.take_along_axis(threat, action[:, None], axis=-1)[:, 0]
+    least = jnp.min(threat, axis=-1)
+    return ~((taken <= x) | ((least > x) & (taken <= least)))
+
+
+def init(key: Array, pmdp: PMDP, config: LoopConfig) -> LoopState:
+    """Starts all environments, a fresh learner and an empty replay."""
+    reset_key, net_key, warm_key, key = jax.random.split(key, 4)
+    batch, num_actions = config.num_envs, pmdp.env.num_actions(pmdp.params)
+    network, replay = make_network(config, num_actions), make_replay(config)
+    resets = jax.random.split(reset_key, batch)
+    states = jax.vmap(pmdp.env.reset, (0, None))(resets, pmdp.params)
+    encoded, threat, bits = _look(pmdp, states)
+    zeros = jnp.zeros(batch, threat.dtype)
+    false = jnp.zeros(batch, bool)
+    taken = Taken(encoded, jnp.zeros(batch, jnp.int32), zeros, false, false, encoded, bits)
+    window = jax.tree.map(lambda a: jnp.stack([a] * config.n_step), taken)
+    example = jax.vmap(n_step_transition, (1, None))(window, config.learner.gamma)
+    state = LoopState(
+        states=states,
+        encoded=encoded,
+        threat=threat,
+        bits=bits,
+        score=zeros,
+        window=window,
+        learner=dqn.init(net_key, network, encoded, config.learner),
+        replay=replay.init(jax.tree.map(lambda a: a[0], example)),
+        key=key,
+        iteration=jnp.asarray(0, jnp.int32),
+    )
+    # The window is filled by real steps before the first transition is stored.
+    for warm in jax.random.split(warm_key, config.n_step):
+        state, _ = interact(warm, state, pmdp, network, config)
+    return state
+
+
+def chunk(
+    state: LoopState, pmdp: PMDP, config: LoopConfig, iterations: int
+) -> tuple[LoopState, Metrics]:
+    """`iterations` of: act, step, look, store, sample, learn. Metrics are summed."""
+    network = make_network(config, pmdp.env.num_actions(pmdp.params))
+    replay = make_replay(config)
+
+    def learn(state: LoopState, key: Array) -> tuple[Learner, Any, Array]:
+        """One update from the replay."""
+        sample = replay.sample(state.replay, key)
+        weights = jnp.ones(config.batch)
+        if config.prioritised:
+            # Importance weights of prioritised replay, relative to the largest.
+            rise = jnp.minimum(state.iteration / max(1, config.iterations), 1.0)
+            power = config.importance + rise * (1 - config.importance)
+            weights = (sample.probabilities + 1e-12) ** -power
+            weights = weights / jnp.max(weights)
+        learner, loss, errors = dqn.update(
+            state.learner, network, sample.experience, weights, config.learner
+        )
+        stored = state.replay
+        if config.prioritised:
+            priorities = jnp.abs(errors) + 1e-3
+            stored = replay.set_priorities(stored, sample.indices, priorities)
+        return learner, stored, loss
+
+    def wait(state: LoopState, key: Array) -> tuple[Learner, Any, Array]:
+        return state.learner, state.replay, jnp.zeros((), state.score.dtype)
+
+    def iteration(state: LoopState, _) -> tuple[LoopState, Metrics]:
+        key, act_key, *learn_keys = jax.random.split(state.key, 2 + config.updates)
+        state, metrics = interact(act_key, state, pmdp, network, config)
+        new = jax.vmap(n_step_transition, (1, None))(state.window, config.learner.gamma)
+        state = state._replace(replay=replay.add(state.replay, new), key=key)
+        ready = replay.can_sample(state.replay)
+        for learn_key in learn_keys:
+            learner, stored, loss = jax.lax.cond(ready, learn, wait, state, learn_key)
+            state = state._replace(learner=learner, replay=stored)
+            metrics = metrics._replace(loss=metrics.loss + loss)
+        return state._replace(iteration=state.iteration + 1), metrics
+
+    state, metrics = jax.lax.scan(iteration, state, None, length=iterations)
+    return state, jax.tree.map(lambda m: jnp.sum(m, axis=0), metrics)

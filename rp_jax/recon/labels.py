@@ -1,0 +1,88 @@
+"""Threats of one state in a sub-R-MDP: T_n(s, a) of equation 3, for all actions at once.
+
+Both estimators take any start state and return the same thing. The danger is the event's first
+occurrence: T_n(s, a) = E[beta^K 1{K <= horizon}], K the first step at which hazard n is hit (0 if
+it is hit already), under the action a first and the baseline policy eta^(o) after it.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from rp_jax.hazards import SubRMDP
+
+
+class Labels(struct.PyTreeNode):
+    """Threats and their standard errors."""
+
+    threat: Array  # (A,)
+    stderr: Array  # (A,), 0 where exact
+
+
+def exact_threat(key: Array, agent: Any, hazard: Any, sub: SubRMDP) -> Labels:
+    """Enumerates all baseline controls; exact for hazards that stay where they are.
+
+    A tree of A * K^(horizon - 2) leaves for an agent whose controls act one step later (K
+    baseline controls), of A * K^(horizon - 1) otherwise. `key` is not used.
+    """
+    del key
+    source, model = sub.source, sub.agent
+    controls, probabilities = model.baseline.controls, model.baseline.probabilities
+    any_control = jax.tree.map(lambda table: table[0], controls)
+
+    def value(agent: Any, k: int) -> Array:
+        """E[beta^(K - k)] from the agent's state at step k, for all steps up to the horizon."""
+        hit = source.hits(agent, hazard)
+        if k == source.horizon:
+            later = jnp.zeros_like(sub.beta)
+        elif k == source.horizon - 1 and model.delayed:
+            later = value(model.step(agent, any_control), k + 1)
+        else:
+            branch = jax.vmap(lambda control: value(model.step(agent, control), k + 1))
+            later = jnp.sum(probabilities * branch(controls))
+        return jnp.where(hit, 1.0, sub.beta * later)
+
+    def first(action: Any) -> Array:
+        return value(model.step(agent, action), 1)
+
+    threat = jax.vmap(first)(model.actions) * sub.beta
+    threat = jnp.where(source.hits(agent, hazard), 1.0, threat)
+    return Labels(threat=threat, stderr=jnp.zeros_like(threat))
+
+
+def monte_carlo_threat(
+    key: Array, agent: Any, hazard: Any, sub: SubRMDP, paths: int = 256
+) -> Labels:
+    """Averages `paths` rollouts; for any hazard.
+
+    The same draws serve all actions (common random numbers), and a hazard that does not heed
+    the agent is moved once for all of them.
+    """
+    source, model = sub.source, sub.agent
+    ours, theirs = jax.random.split(key)
+    controls = model.baseline.sample(ours, (source.horizon - 1, paths))
+    noise = source.draw(theirs, (source.horizon, paths))
+
+    def rollout(action: Any, controls: Any, noise: Any) -> Array:
+        """beta^K 1{K <= horizon} of one path."""
+        us, other = agent, hazard
+        hit = source.hits(us, other)
+        value = jnp.where(hit, 1.0, 0.0)
+        weight = jnp.ones_like(value)
+        for k in range(source.horizon):
+            control = action if k == 0 else jax.tree.map(lambda c, k=k: c[k - 1], controls)
+            before, us = us, model.step(us, control)
+            other = source.step(other, before, jax.tree.map(lambda n, k=k: n[k], noise))
+            weight = weight * sub.beta
+            now = source.hits(us, other) & ~hit
+            value = jnp.where(now, weight, value)
+            hit = hit | now
+        return value
+
+    over_actions = jax.vmap(rollout, (0, None, None))
+    values = jax.vmap(over_actions, (None, 1, 1))(model.actions, controls, noise)  # (paths, A)
+    spread = jnp.std(values, axis=0, ddof=1) if paths > 1 else jnp.ones(values.shape[1])
+    return Labels(threat=jnp.mean(values, axis=0), stderr=spread / jnp.sqrt(paths))

@@ -1,0 +1,65 @@
+"""The admissible set of the P-MDP and the choices inside it (Definitions 1 and 3).
+
+Primitives are unbatched: threats and values are (A,), masks (A,) bool.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+
+class Shield(NamedTuple):
+    """What a state allows."""
+
+    admissible: Array  # (A,) bool, never empty
+    secure: Array  # () bool, s is in S^{eta,x}: some action's threat is at most x
+
+
+def shield(threat: Array, x: Array | float) -> Shield:
+    """A^{eta,x}(s) = {a : T(s, a) <= x}; where that is empty, greedy-eta alone (equation 8).
+
+    A threat that is nan is never admissible; if all are nan, action 0 remains.
+
+    Args:
+        threat: (A,) action threats T(s, .).
+        x: threshold; infinity switches the shield off.
+    """
+    allowed = threat <= x
+    secure = jnp.any(allowed)
+    fallback = jnp.arange(threat.shape[0]) == greedy_eta(threat)
+    return Shield(admissible=jnp.where(secure, allowed, fallback), secure=secure)
+
+
+def greedy_eta(threat: Array) -> Array:
+    """() int, the least threatening action; nan counts as the worst."""
+    return jnp.argmin(jnp.where(jnp.isnan(threat), jnp.inf, threat))
+
+
+def masked_max(values: Array, admissible: Array) -> Array:
+    """() max of `values` (A,) over the admissible actions (Algorithm 4, line 6)."""
+    return jnp.max(jnp.where(admissible, values, -jnp.inf))
+
+
+def masked_argmax(values: Array, admissible: Array) -> Array:
+    """() int, the admissible action of the greatest value."""
+    return jnp.argmax(jnp.where(admissible, values, -jnp.inf))
+
+
+def masked_sample(key: Array, admissible: Array) -> Array:
+    """() int, uniform over the admissible actions."""
+    rank = jnp.cumsum(admissible)
+    uniform = jax.random.uniform(key)
+    chosen = jnp.minimum(jnp.floor(uniform * rank[-1]), rank[-1] - 1)
+    return jnp.argmax(rank > chosen)
+
+
+def to_bits(admissible: Array) -> Array:
+    """() int32, the mask (A,) as one integer, for storage; A <= 31."""
+    return jnp.sum(jnp.where(admissible, 1 << jnp.arange(admissible.shape[0]), 0))
+
+
+def from_bits(bits: Array, num_actions: int) -> Array:
+    """(A,) bool, the inverse of `to_bits`."""
+    return ((bits >> jnp.arange(num_actions)) & 1).astype(bool)

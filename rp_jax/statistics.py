@@ -1,0 +1,47 @@
+"""Honest statistics: intervals for rates and means, over episodes and over seeds."""
+
+import numpy as np
+from scipy import stats
+
+from rp_jax.validate import number
+
+
+def clopper_pearson(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Exact two-sided interval of a rate, k events of n.
+
+    Raises:
+        ValueError: not 0 <= k <= n, n < 1, or a confidence outside (0, 1).
+    """
+    number("n", n, least=1, integer=True)
+    number("k", k, least=0, most=n, integer=True)
+    _check_confidence(confidence)
+    tail = (1 - confidence) / 2
+    lower = 0.0 if k == 0 else float(stats.beta.ppf(tail, k, n - k + 1))
+    upper = 1.0 if k == n else float(stats.beta.ppf(1 - tail, k + 1, n - k))
+    return lower, upper
+
+
+def upper_bound(k: int, n: int, confidence: float = 0.95) -> float:
+    """Exact one-sided upper bound of a rate: what k events of n exclude."""
+    number("n", n, least=1, integer=True)
+    number("k", k, least=0, most=n, integer=True)
+    _check_confidence(confidence)
+    return 1.0 if k == n else float(stats.beta.ppf(confidence, k + 1, n - k))
+
+
+def mean_interval(values: np.ndarray, confidence: float = 0.95) -> tuple[float, float]:
+    """(mean, half-width) of Student's interval; the half-width is nan for one value."""
+    _check_confidence(confidence)
+    values = np.asarray(values, float)
+    n = values.size
+    number("number of values", n, least=1)
+    if n == 1:
+        return float(values.mean()), float("nan")
+    width = stats.t.ppf((1 + confidence) / 2, n - 1) * values.std(ddof=1) / np.sqrt(n)
+    return float(values.mean()), float(width)
+
+
+def _check_confidence(confidence: float) -> None:
+    number("confidence", confidence, above=0)
+    if confidence >= 1:
+        raise ValueError(f"confidence is {confidence!r}; it must be below 1")

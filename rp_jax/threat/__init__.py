@@ -1,0 +1,1 @@
+"""Threat functions: learned per kind of hazard, summed over hazards (Theorem 3)."""

@@ -1,0 +1,115 @@
+"""Supervised learning of a threat function from labelled states (paper, appendix G.1)."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+from jax import Array
+
+from rp_jax.hazards import SubRMDP
+from rp_jax.kinematics import mirrored_actions
+from rp_jax.threat.model import ThreatModel, ThreatNetwork
+
+
+class Dataset(NamedTuple):
+    """Labelled states of one sub-R-MDP."""
+
+    features: Array  # (n, F)
+    threat: Array  # (n, A)
+
+
+class FitConfig(struct.PyTreeNode):
+    """How a threat model is fitted."""
+
+    hidden: tuple[int, ...] = struct.field(pytree_node=False, default=(128, 64))
+    activation: str = struct.field(pytree_node=False, default="silu")
+    steps: int = struct.field(pytree_node=False, default=10_000)
+    batch: int = struct.field(pytree_node=False, default=1024)
+    learning_rate: float = struct.field(pytree_node=False, default=3e-3)
+    epsilon: float = struct.field(pytree_node=False, default=1e-8)  # Adam's
+    cosine: bool = struct.field(pytree_node=False, default=True)  # else a constant rate
+    validation: float = struct.field(pytree_node=False, default=0.1)  # share held out
+
+
+class FitState(NamedTuple):
+    """Carried through the fit."""
+
+    params: dict
+    opt_state: optax.OptState
+    key: Array
+
+
+def mirror(data: Dataset, sub: SubRMDP) -> Dataset:
+    """Adds the left-right mirror image of every row: the sub-R-MDP is symmetric."""
+    swapped = data.threat[:, mirrored_actions(sub.agent.actions)]
+    return Dataset(
+        features=jnp.concatenate([data.features, sub.source.mirrored(data.features)]),
+        threat=jnp.concatenate([data.threat, swapped]),
+    )
+
+
+def split(key: Array, data: Dataset, share: float) -> tuple[Dataset, Dataset]:
+    """(training, validation) rows, drawn at random."""
+    n = len(data.features)
+    held = int(round(n * share))
+    order = jax.random.permutation(key, n)
+    part = lambda rows: jax.tree.map(lambda a: a[rows], data)  # noqa: E731
+    return part(order[held:]), part(order[:held])
+
+
+def cross_entropy(logits: Array, threat: Array) -> Array:
+    """Mean cross entropy; unbiased under noisy labels, least at their expectation."""
+    return jnp.mean(optax.sigmoid_binary_cross_entropy(logits, threat))
+
+
+def optimiser(config: FitConfig) -> optax.GradientTransformation:
+    """Adam, with the rate falling to zero along a cosine unless told otherwise."""
+    rate = config.learning_rate
+    schedule = optax.cosine_decay_schedule(rate, config.steps) if config.cosine else rate
+    return optax.adam(schedule, eps=config.epsilon)
+
+
+def init(key: Array, sub: SubRMDP, data: Dataset, config: FitConfig) -> tuple[ThreatModel, FitState]:
+    """A fresh model whose inputs are scaled by the spread of the data, and its fit's state."""
+    network = ThreatNetwork(config.hidden, data.threat.shape[-1], config.activation)
+    begin, onward = jax.random.split(key)
+    params = network.init(begin, data.features[:1])
+    scale = 1.0 / (jnp.std(data.features, axis=0) + 1e-6)
+    model = ThreatModel(source=sub.source, params=params, scale=scale, network=network)
+    return model, FitState(params, optimiser(config).init(params), onward)
+
+
+def run(
+    model: ThreatModel, state: FitState, data: Dataset, config: FitConfig, steps: int
+) -> tuple[FitState, Array]:
+    """`steps` gradient steps in one scan. Returns the state and the loss of each step."""
+    transform = optimiser(config)
+
+    def loss(params, features, threat):
+        return cross_entropy(model.replace(params=params).logits(features), threat)
+
+    def step(state: FitState, _):
+        key, draw = jax.random.split(state.key)
+        rows = jax.random.randint(draw, (config.batch,), 0, len(data.features))
+        value, grads = jax.value_and_grad(loss)(
+            state.params, data.features[rows], data.threat[rows]
+        )
+        updates, opt_state = transform.update(grads, state.opt_state, state.params)
+        return FitState(optax.apply_updates(state.params, updates), opt_state, key), value
+
+    return jax.lax.scan(step, state, None, length=steps)
+
+
+def unsafe_called_safe(predicted: np.ndarray, true: np.ndarray, x: float) -> float:
+    """Of the pairs (s, a) truly above x, the share that the prediction lets pass."""
+    unsafe = true > x
+    return float(((predicted <= x) & unsafe).sum() / max(1, unsafe.sum()))
+
+
+def safe_called_unsafe(predicted: np.ndarray, true: np.ndarray, x: float) -> float:
+    """Of the pairs (s, a) truly at most x, the share that the prediction forbids."""
+    safe = true <= x
+    return float(((predicted > x) & safe).sum() / max(1, safe.sum()))
