@@ -13,8 +13,6 @@ from rp_jax import shield, statistics
 from rp_jax.envs.base import select
 from rp_jax.planning.pmdp import PMDP, Percept
 
-# (key, states, percept) -> actions (B,) int; keys and states have a leading axis (B,).
-Policy = Callable[[Array, Any, Percept], Array]
 
 
 class Episodes(NamedTuple):
@@ -126,3 +124,72 @@ def summarise(rows: Episodes, penalty: float) -> dict[str, Any]:
         "steps": steps,
         "causes": {kind: int((hit & ~safe).sum()) for kind, hit in rows.causes.items()},
     }
+
+
+class Recording(NamedTuple):
+    """Episodes step by step, axes (time, episode)."""
+
+    states: Any  # before each step; after an end, the terminal state again
+    action: Array
+    threat: Array  # (time, episode, A)
+    admissible: Array  # (time, episode, A)
+    secure: Array
+    alive: Array  # bool, the episode had not ended before this step
+
+
+def record(
+    key: Array,
+    pmdp: PMDP,
+    values: Callable[[Percept], Array],
+    starts: Any,
+    steps: int,
+) -> Recording:
+    """Plays episodes from given states and keeps every step, for figures and animations.
+
+    Args:
+        key: of the environment's randomness.
+        pmdp: the environment, the threats and the threshold.
+        values: scores the actions.
+        starts: states with leading axis (episodes,).
+        steps: how many are recorded, ended or not.
+    """
+    count = starts.time.shape[0]
+
+    def step(carry, key):
+        states, alive = carry
+        percept = pmdp.perceive(states)
+        action = jax.vmap(shield.masked_argmax)(values(percept), percept.admissible)
+        keys = jax.random.split(key, count)
+        move = jax.vmap(pmdp.env.step, (0, 0, 0, None))
+        reached, outcome = move(keys, states, action, pmdp.params)
+        kept = jax.vmap(select)(alive, reached, states)
+        shown = Recording(
+            states, action, percept.threat, percept.admissible, percept.secure, alive
+        )
+        return (kept, alive & ~outcome.done), shown
+
+    begin = (starts, jnp.ones(count, bool))
+    return jax.lax.scan(step, begin, jax.random.split(key, steps))[1]
+
+
+def visited_states(key: Array, pmdp: PMDP, count: int, steps: int = 30) -> Any:
+    """States (count,) that exploring inside the admissible set comes by, 0 to `steps` steps in."""
+    start_key, stop_key, walk_key = jax.random.split(key, 3)
+    starts = jax.vmap(pmdp.env.reset, (0, None))(jax.random.split(start_key, count), pmdp.params)
+    stop = jax.random.randint(stop_key, (count,), 0, steps)
+
+    def step(carry, key):
+        states, alive, t = carry
+        percept = pmdp.perceive(states)
+        pick, move = jax.random.split(key)
+        action = jax.vmap(shield.masked_sample)(
+            jax.random.split(pick, count), percept.admissible
+        )
+        keys = jax.random.split(move, count)
+        move_all = jax.vmap(pmdp.env.step, (0, 0, 0, None))
+        reached, outcome = move_all(keys, states, action, pmdp.params)
+        going = alive & (t < stop) & ~outcome.done
+        return (jax.vmap(select)(going, reached, states), going, t + 1), None
+
+    begin = (starts, jnp.ones(count, bool), jnp.asarray(0))
+    return jax.lax.scan(step, begin, jax.random.split(walk_key, steps))[0][0]

@@ -34,6 +34,10 @@ class HazardSource(Protocol):
     def horizon(self) -> int:
         """Steps after which a rollout of the sub-R-MDP is cut."""
 
+    @property
+    def static(self) -> bool:
+        """Whether hazards stay where they are, so that threats can be enumerated."""
+
     def draw(self, key: Array, shape: tuple[int, ...] = ()) -> Any:
         """The random numbers of one step (or of an array of steps)."""
 
@@ -119,6 +123,7 @@ class WallPoint(struct.PyTreeNode):
     radius: Array  # () room units
     window: Window
     horizon: int = struct.field(pytree_node=False, default=5)
+    static: bool = struct.field(pytree_node=False, default=True)
 
     @classmethod
     def create(cls, agent: AgentModel, radius: float = 0.1, horizon: int = 5) -> "WallPoint":
@@ -166,6 +171,7 @@ class MovingObstacle(struct.PyTreeNode):
     behaviour: ControlDistribution  # what it does at each step
     window: Window
     horizon: int = struct.field(pytree_node=False, default=8)
+    static: bool = struct.field(pytree_node=False, default=False)
 
     @classmethod
     def create(

@@ -40,6 +40,7 @@ class Env(Protocol):
     """
 
     LIDAR_BINS: int  # how many of an observation's first values are a LIDAR's distances
+    SCALE: tuple[float, ...]  # brings the others to the order of 1, for learners
 
     def reset(self, key: Array, params: Any) -> Any:
         """Draws a start state. Any other state of the same type can be stepped as well."""

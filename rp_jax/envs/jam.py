@@ -33,6 +33,7 @@ CLEARANCE = 1.0  # obstacles appear at least this far from the agent
 ZONE = 0.5  # side (released) or radius (paper) of the corner safety zones
 LIDAR_BINS = 360
 SEEN_OBSTACLES = 8
+SCALE = (1.0, 1.0, 1.0, 10.0) * (SEEN_OBSTACLES + 1)  # of x, y, heading, speed, for learners
 UNSEEN = (-1.5, -1.51)  # where the observation puts obstacles that do not exist
 FIDELITIES = ("released", "paper")
 MOST_OBSTACLES = 400  # of radius .1: more leave no free place in the room

@@ -1,16 +1,17 @@
 """Masked Double DQN: Algorithm 4 with a network for Q."""
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import linen as nn
-from flax import struct
 from jax import Array
 
 from rp_jax import shield
 from rp_jax.planning.pmdp import Encoded
+from rp_jax.validate import number
 
 
 class Transition(NamedTuple):
@@ -24,17 +25,27 @@ class Transition(NamedTuple):
     next_admissible: Array  # () int32, `shield.to_bits`
 
 
-class DQNConfig(struct.PyTreeNode):
+@dataclass(frozen=True)
+class DQNConfig:
     """Hyperparameters of the learner."""
 
-    gamma: float = struct.field(pytree_node=False, default=0.95)
-    learning_rate: float = struct.field(pytree_node=False, default=1e-3)
-    epsilon: float = struct.field(pytree_node=False, default=1e-8)  # Adam's
-    anneal: bool = struct.field(pytree_node=False, default=True)  # learning rate falls to a tenth
-    polyak: float = struct.field(pytree_node=False, default=0.01)  # 0: copy every `period`
-    period: int = struct.field(pytree_node=False, default=1000)  # updates between copies
-    reward_scale: float = struct.field(pytree_node=False, default=1.0)
-    total_updates: int = struct.field(pytree_node=False, default=10_000)
+    gamma: float = 0.95
+    learning_rate: float = 3e-3
+    epsilon: float = 1e-8  # Adam's
+    anneal: bool = True  # learning rate falls to a tenth
+    polyak: float = 0.01  # 0: copy every `period`
+    period: int = 1000  # updates between copies
+    reward_scale: float = 0.1
+    total_updates: int = 10_000  # over which the learning rate falls
+
+    def validate(self, name: str) -> None:
+        """Raises ValueError, naming the field after `name`, if a value is out of range."""
+        number(f"{name}.gamma", self.gamma, least=0, most=1)
+        number(f"{name}.learning_rate", self.learning_rate, above=0)
+        number(f"{name}.epsilon", self.epsilon, above=0)
+        number(f"{name}.polyak", self.polyak, least=0, most=1)
+        number(f"{name}.period", self.period, least=1, integer=True)
+        number(f"{name}.reward_scale", self.reward_scale, above=0)
 
 
 class Learner(NamedTuple):

@@ -1,12 +1,12 @@
 """The training loop: acting, threat, replay and learning in one jitted chunk."""
 
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import flashbax
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-from flax import struct
 from jax import Array
 
 from rp_jax import shield
@@ -15,31 +15,50 @@ from rp_jax.planning import dqn
 from rp_jax.planning.dqn import DQNConfig, Learner, Transition
 from rp_jax.planning.networks import NETWORKS
 from rp_jax.planning.pmdp import PMDP, Encoded
+from rp_jax.validate import number, one_of
 
 
-class LoopConfig(struct.PyTreeNode):
+@dataclass(frozen=True)
+class LoopConfig:
     """Sizes and schedules of the loop."""
 
-    network: str = struct.field(pytree_node=False, default="tuned")
-    learner: DQNConfig = struct.field(pytree_node=False, default=DQNConfig())
-    steps: int = struct.field(pytree_node=False, default=600_000)  # agent steps in all
-    num_envs: int = struct.field(pytree_node=False, default=256)
-    batch: int = struct.field(pytree_node=False, default=1024)
-    updates: int = struct.field(pytree_node=False, default=1)  # per step of all environments
-    n_step: int = struct.field(pytree_node=False, default=3)
-    replay: int = struct.field(pytree_node=False, default=200_000)  # transitions kept
-    replay_start: int = struct.field(pytree_node=False, default=5_000)
-    prioritised: bool = struct.field(pytree_node=False, default=False)
-    priority_exponent: float = struct.field(pytree_node=False, default=0.6)
-    importance: float = struct.field(pytree_node=False, default=0.4)  # rises to 1 at the end
-    explore_from: float = struct.field(pytree_node=False, default=1.0)
-    explore_to: float = struct.field(pytree_node=False, default=0.05)
-    explore_share: float = struct.field(pytree_node=False, default=0.5)  # of the steps, linear
+    network: str = "tuned"
+    learner: DQNConfig = field(default_factory=DQNConfig)
+    steps: int = 600_000  # agent steps in all
+    num_envs: int = 256
+    batch: int = 1024
+    updates: int = 1  # per step of all environments
+    n_step: int = 3
+    replay: int = 200_000  # transitions kept
+    replay_start: int = 5_000
+    prioritised: bool = False
+    priority_exponent: float = 0.6
+    importance: float = 0.4  # rises to 1 at the end
+    explore_from: float = 1.0
+    explore_to: float = 0.05
+    explore_share: float = 0.3  # of the steps, over which exploration falls
+
+    def validate(self, name: str) -> None:
+        """Raises ValueError, naming the field after `name`, if a value is out of range."""
+        one_of(f"{name}.network", self.network, NETWORKS)
+        self.learner.validate(f"{name}.learner")
+        number(f"{name}.num_envs", self.num_envs, least=1, integer=True)
+        number(f"{name}.steps", self.steps, least=self.num_envs, integer=True)
+        number(f"{name}.batch", self.batch, least=1, integer=True)
+        number(f"{name}.updates", self.updates, least=1, integer=True)
+        number(f"{name}.n_step", self.n_step, least=1, most=100, integer=True)
+        number(f"{name}.replay", self.replay, least=max(self.batch, self.num_envs), integer=True)
+        number(f"{name}.replay_start", self.replay_start, least=1, most=self.replay, integer=True)
+        number(f"{name}.priority_exponent", self.priority_exponent, least=0, most=1)
+        number(f"{name}.importance", self.importance, least=0, most=1)
+        number(f"{name}.explore_from", self.explore_from, least=0, most=1)
+        number(f"{name}.explore_to", self.explore_to, least=0, most=1)
+        number(f"{name}.explore_share", self.explore_share, above=0, most=1)
 
     @property
     def iterations(self) -> int:
         """Steps of all environments at once."""
-        return self.steps // self.num_envs
+        return -(-self.steps // self.num_envs)
 
     @property
     def samples_per_step(self) -> float:
@@ -87,9 +106,10 @@ class LoopState(NamedTuple):
     iteration: Array  # ()
 
 
-def make_network(config: LoopConfig, num_actions: int) -> nn.Module:
+def make_network(config: LoopConfig, pmdp: PMDP) -> nn.Module:
     """The Q-network that the configuration names."""
-    return NETWORKS[config.network](num_actions=num_actions)
+    num_actions = pmdp.env.num_actions(pmdp.params)
+    return NETWORKS[config.network](num_actions=num_actions, scale=pmdp.env.SCALE)
 
 
 def make_replay(config: LoopConfig) -> Any:
@@ -212,11 +232,11 @@ def _inadmissible(threat: Array, action: Array, x: Array) -> Array:
     return ~((taken <= x) | ((least > x) & (taken <= least)))
 
 
-def init(key: Array, pmdp: PMDP, config: LoopConfig) -> LoopState:
-    """Starts all environments, a fresh learner and an empty replay."""
+def init(key: Array, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics]:
+    """Starts all environments and a learner, and fills the replay up to `replay_start`."""
     reset_key, net_key, warm_key, key = jax.random.split(key, 4)
-    batch, num_actions = config.num_envs, pmdp.env.num_actions(pmdp.params)
-    network, replay = make_network(config, num_actions), make_replay(config)
+    batch = config.num_envs
+    network, replay = make_network(config, pmdp), make_replay(config)
     resets = jax.random.split(reset_key, batch)
     states = jax.vmap(pmdp.env.reset, (0, None))(resets, pmdp.params)
     encoded, threat, bits = _look(pmdp, states)
@@ -237,52 +257,64 @@ def init(key: Array, pmdp: PMDP, config: LoopConfig) -> LoopState:
         key=key,
         iteration=jnp.asarray(0, jnp.int32),
     )
-    # The window is filled by real steps before the first transition is stored.
-    for warm in jax.random.split(warm_key, config.n_step):
-        state, _ = interact(warm, state, pmdp, network, config)
-    return state
+    # The window is filled by real steps, then the replay, before anything is learned.
+    window_keys = jax.random.split(warm_key, config.n_step)
+    metrics = []
+    for warm in window_keys:
+        state, new = interact(warm, state, pmdp, network, config)
+        metrics.append(new)
+    fill = -(-config.replay_start // batch)
+    state, new = jax.lax.scan(lambda s, _: collect(s, pmdp, config), state, None, length=fill)
+    return state, jax.tree.map(lambda first, *a: jnp.sum(first) + sum(a), new, *metrics)
+
+
+def collect(state: LoopState, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics]:
+    """Act, step, look, store: one step of every environment."""
+    network, replay = make_network(config, pmdp), make_replay(config)
+    key, act_key = jax.random.split(state.key)
+    state, metrics = interact(act_key, state, pmdp, network, config)
+    new = jax.vmap(n_step_transition, (1, None))(state.window, config.learner.gamma)
+    state = state._replace(
+        replay=replay.add(state.replay, new), key=key, iteration=state.iteration + 1
+    )
+    return state, metrics
+
+
+def learn(
+    key: Array, state: LoopState, pmdp: PMDP, config: LoopConfig
+) -> tuple[LoopState, Array]:
+    """Sample and update once; returns the loss."""
+    network, replay = make_network(config, pmdp), make_replay(config)
+    sample = replay.sample(state.replay, key)
+    weights = jnp.ones(config.batch)
+    if config.prioritised:
+        # Importance weights of prioritised replay, relative to the largest.
+        rise = jnp.minimum(state.iteration / config.iterations, 1.0)
+        power = config.importance + rise * (1 - config.importance)
+        weights = (sample.probabilities + 1e-12) ** -power
+        weights = weights / jnp.max(weights)
+    learner, loss, errors = dqn.update(
+        state.learner, network, sample.experience, weights, config.learner
+    )
+    stored = state.replay
+    if config.prioritised:
+        stored = replay.set_priorities(stored, sample.indices, jnp.abs(errors) + 1e-3)
+    return state._replace(learner=learner, replay=stored), loss
 
 
 def chunk(
     state: LoopState, pmdp: PMDP, config: LoopConfig, iterations: int
 ) -> tuple[LoopState, Metrics]:
-    """`iterations` of: act, step, look, store, sample, learn. Metrics are summed."""
-    network = make_network(config, pmdp.env.num_actions(pmdp.params))
-    replay = make_replay(config)
-
-    def learn(state: LoopState, key: Array) -> tuple[Learner, Any, Array]:
-        """One update from the replay."""
-        sample = replay.sample(state.replay, key)
-        weights = jnp.ones(config.batch)
-        if config.prioritised:
-            # Importance weights of prioritised replay, relative to the largest.
-            rise = jnp.minimum(state.iteration / max(1, config.iterations), 1.0)
-            power = config.importance + rise * (1 - config.importance)
-            weights = (sample.probabilities + 1e-12) ** -power
-            weights = weights / jnp.max(weights)
-        learner, loss, errors = dqn.update(
-            state.learner, network, sample.experience, weights, config.learner
-        )
-        stored = state.replay
-        if config.prioritised:
-            priorities = jnp.abs(errors) + 1e-3
-            stored = replay.set_priorities(stored, sample.indices, priorities)
-        return learner, stored, loss
-
-    def wait(state: LoopState, key: Array) -> tuple[Learner, Any, Array]:
-        return state.learner, state.replay, jnp.zeros((), state.score.dtype)
+    """`iterations` of: collect, then learn `config.updates` times. Metrics are summed."""
 
     def iteration(state: LoopState, _) -> tuple[LoopState, Metrics]:
-        key, act_key, *learn_keys = jax.random.split(state.key, 2 + config.updates)
-        state, metrics = interact(act_key, state, pmdp, network, config)
-        new = jax.vmap(n_step_transition, (1, None))(state.window, config.learner.gamma)
-        state = state._replace(replay=replay.add(state.replay, new), key=key)
-        ready = replay.can_sample(state.replay)
-        for learn_key in learn_keys:
-            learner, stored, loss = jax.lax.cond(ready, learn, wait, state, learn_key)
-            state = state._replace(learner=learner, replay=stored)
+        state, metrics = collect(state, pmdp, config)
+        key, *keys = jax.random.split(state.key, 1 + config.updates)
+        state = state._replace(key=key)
+        for learn_key in keys:
+            state, loss = learn(learn_key, state, pmdp, config)
             metrics = metrics._replace(loss=metrics.loss + loss)
-        return state._replace(iteration=state.iteration + 1), metrics
+        return state, metrics
 
     state, metrics = jax.lax.scan(iteration, state, None, length=iterations)
     return state, jax.tree.map(lambda m: jnp.sum(m, axis=0), metrics)

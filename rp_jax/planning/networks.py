@@ -11,14 +11,15 @@ class TunedNetwork(nn.Module):
     """A perceptron on the pooled LIDAR and the rest of the observation."""
 
     num_actions: int
+    scale: tuple[float, ...]  # (R,) brings the rest of the observation to the order of 1
     hidden: tuple[int, ...] = (128, 64)
-    pool: int = 8  # LIDAR bins pooled before the network
 
     @nn.compact
     def __call__(self, seen: Encoded) -> Array:
         """(..., A) action values."""
         scan = 1.0 - seen.scan.astype(seen.rest.dtype) / 255
-        x = jnp.concatenate([scan, seen.rest], axis=-1)
+        scale = jnp.broadcast_to(jnp.asarray(self.scale, seen.rest.dtype), seen.rest.shape)
+        x = jnp.concatenate([scan, seen.rest * scale], axis=-1)
         for width in self.hidden:
             x = nn.silu(nn.Dense(width)(x))
         return nn.Dense(self.num_actions)(x)
@@ -29,7 +30,7 @@ class PaperNetwork(nn.Module):
     50-20 tanh units."""
 
     num_actions: int
-    pool: int = 1
+    scale: tuple[float, ...]  # not used: the paper feeds raw values
 
     @nn.compact
     def __call__(self, seen: Encoded) -> Array:
@@ -45,3 +46,4 @@ class PaperNetwork(nn.Module):
 
 
 NETWORKS = {"tuned": TunedNetwork, "paper": PaperNetwork}
+POOLS = {"tuned": 8, "paper": 1}  # LIDAR bins pooled before the network

@@ -5,6 +5,8 @@ occurrence: T_n(s, a) = E[beta^K 1{K <= horizon}], K the first step at which haz
 it is hit already), under the action a first and the baseline policy eta^(o) after it.
 """
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -20,6 +22,10 @@ class Labels(struct.PyTreeNode):
 
     threat: Array  # (A,)
     stderr: Array  # (A,), 0 where exact
+
+
+# (key, agent, hazard, sub) -> Labels, unbatched.
+Estimator = Callable[[Array, Any, Any, SubRMDP], Labels]
 
 
 def exact_threat(key: Array, agent: Any, hazard: Any, sub: SubRMDP) -> Labels:
@@ -86,3 +92,55 @@ def monte_carlo_threat(
     values = jax.vmap(over_actions, (None, 1, 1))(model.actions, controls, noise)  # (paths, A)
     spread = jnp.std(values, axis=0, ddof=1) if paths > 1 else jnp.ones(values.shape[1])
     return Labels(threat=jnp.mean(values, axis=0), stderr=spread / jnp.sqrt(paths))
+
+
+def best_estimator(sub: SubRMDP, paths: int) -> Estimator:
+    """Exact enumeration where the hazard stays put, Monte Carlo with `paths` rollouts elsewhere."""
+    if sub.source.static:
+        return exact_threat
+    return functools.partial(monte_carlo_threat, paths=paths)
+
+
+@functools.partial(jax.jit, static_argnames=("estimator", "batch"))
+def _label(key, agent, hazard, sub, estimator, batch):
+    count = jax.tree.leaves(agent)[0].shape[0]
+    keys = jax.random.split(key, count)
+    one = lambda row: estimator(*row, sub)  # noqa: E731
+    return jax.lax.map(one, (keys, agent, hazard), batch_size=batch)
+
+
+def label(
+    key: Array,
+    agent: Any,
+    hazard: Any,
+    sub: SubRMDP,
+    estimator: Estimator,
+    *,
+    batch: int = 32,
+    rows: int = 8192,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> Labels:
+    """Labels many states, leading axis (n,), `rows` to a call and `batch` side by side.
+
+    Args:
+        key: each row gets its own from it.
+        agent: (n, ...) agent states.
+        hazard: (n, ...) hazard states.
+        sub: the sub-R-MDP.
+        estimator: `exact_threat` or a `monte_carlo_threat`.
+        batch: rows simulated at once; bounds the memory.
+        rows: rows between two reports of progress.
+        on_progress: called with (rows done, n).
+    """
+    count = jax.tree.leaves(agent)[0].shape[0]
+    parts = []
+    for start in range(0, count, rows):
+        # The last call repeats rows, so that there is one shape and one compilation.
+        index = jnp.minimum(start + jnp.arange(min(rows, count)), count - 1)
+        take = lambda tree, index=index: jax.tree.map(lambda a: a[index], tree)  # noqa: E731
+        chunk = jax.random.fold_in(key, start)
+        parts.append(_label(chunk, take(agent), take(hazard), sub, estimator, batch))
+        if on_progress:
+            jax.block_until_ready(parts[-1])
+            on_progress(min(start + rows, count), count)
+    return jax.tree.map(lambda *a: jnp.concatenate(a)[:count], *parts)

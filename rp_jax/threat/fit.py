@@ -1,17 +1,17 @@
 """Supervised learning of a threat function from labelled states (paper, appendix G.1)."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
-from flax import struct
 from jax import Array
 
 from rp_jax.hazards import SubRMDP
 from rp_jax.kinematics import mirrored_actions
-from rp_jax.threat.model import ThreatModel, ThreatNetwork
+from rp_jax.threat.model import ACTIVATIONS, ThreatModel, ThreatNetwork
+from rp_jax.validate import number, one_of
 
 
 class Dataset(NamedTuple):
@@ -21,17 +21,31 @@ class Dataset(NamedTuple):
     threat: Array  # (n, A)
 
 
-class FitConfig(struct.PyTreeNode):
+@dataclass(frozen=True)
+class FitConfig:
     """How a threat model is fitted."""
 
-    hidden: tuple[int, ...] = struct.field(pytree_node=False, default=(128, 64))
-    activation: str = struct.field(pytree_node=False, default="silu")
-    steps: int = struct.field(pytree_node=False, default=10_000)
-    batch: int = struct.field(pytree_node=False, default=1024)
-    learning_rate: float = struct.field(pytree_node=False, default=3e-3)
-    epsilon: float = struct.field(pytree_node=False, default=1e-8)  # Adam's
-    cosine: bool = struct.field(pytree_node=False, default=True)  # else a constant rate
-    validation: float = struct.field(pytree_node=False, default=0.1)  # share held out
+    hidden: tuple[int, ...] = (128, 64)
+    activation: str = "silu"
+    steps: int = 10_000
+    batch: int = 1024
+    learning_rate: float = 3e-3
+    epsilon: float = 1e-8  # Adam's
+    cosine: bool = True  # else a constant rate
+    validation: float = 0.05  # share of the states held out
+
+    def validate(self, name: str) -> None:
+        """Raises ValueError, naming the field after `name`, if a value is out of range."""
+        if not self.hidden:
+            raise ValueError(f"{name}.hidden is {self.hidden}; it must name at least one width")
+        for width in self.hidden:
+            number(f"{name}.hidden", width, least=1, most=4096, integer=True)
+        one_of(f"{name}.activation", self.activation, ACTIVATIONS)
+        number(f"{name}.steps", self.steps, least=1, integer=True)
+        number(f"{name}.batch", self.batch, least=1, integer=True)
+        number(f"{name}.learning_rate", self.learning_rate, above=0)
+        number(f"{name}.epsilon", self.epsilon, above=0)
+        number(f"{name}.validation", self.validation, above=0, most=0.9)
 
 
 class FitState(NamedTuple):
@@ -78,7 +92,7 @@ def init(key: Array, sub: SubRMDP, data: Dataset, config: FitConfig) -> tuple[Th
     begin, onward = jax.random.split(key)
     params = network.init(begin, data.features[:1])
     scale = 1.0 / (jnp.std(data.features, axis=0) + 1e-6)
-    model = ThreatModel(source=sub.source, params=params, scale=scale, network=network)
+    model = ThreatModel(source=sub.source, params=params, scale=scale, shift=jnp.zeros(()), network=network)
     return model, FitState(params, optimiser(config).init(params), onward)
 
 
@@ -101,15 +115,3 @@ def run(
         return FitState(optax.apply_updates(state.params, updates), opt_state, key), value
 
     return jax.lax.scan(step, state, None, length=steps)
-
-
-def unsafe_called_safe(predicted: np.ndarray, true: np.ndarray, x: float) -> float:
-    """Of the pairs (s, a) truly above x, the share that the prediction lets pass."""
-    unsafe = true > x
-    return float(((predicted <= x) & unsafe).sum() / max(1, unsafe.sum()))
-
-
-def safe_called_unsafe(predicted: np.ndarray, true: np.ndarray, x: float) -> float:
-    """Of the pairs (s, a) truly at most x, the share that the prediction forbids."""
-    safe = true <= x
-    return float(((predicted > x) & safe).sum() / max(1, safe.sum()))

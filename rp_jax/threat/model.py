@@ -34,12 +34,13 @@ class ThreatModel(struct.PyTreeNode):
     source: Any  # a HazardSource: features and window
     params: Any  # weights of `network`
     scale: Array  # (F,) features are multiplied by this before the network
+    shift: Array  # () added to every logit; above 0 to err on the safe side
     network: ThreatNetwork = struct.field(pytree_node=False)
 
     def logits(self, features: Array) -> Array:
         """(..., F) -> (..., A)."""
         scale = jnp.broadcast_to(self.scale, features.shape)
-        return self.network.apply(self.params, features * scale)
+        return self.network.apply(self.params, features * scale) + self.shift
 
     def __call__(self, features: Array) -> Array:
         """(..., F) -> (..., A) threats in [0, 1]."""

@@ -1,0 +1,1 @@
+"""Experiments: one module per task; run them as `python -m experiments.NAME --help`."""

@@ -1,0 +1,185 @@
+"""Jam (figure 4, table 1): trained among 8 obstacles, tested among 3, 8 and 15.
+
+python -m experiments.jam --preset quick
+"""
+
+from dataclasses import dataclass, field
+
+import jax
+import numpy as np
+
+from experiments import cli, pipeline
+from rp_jax.envs import jam
+from rp_jax.planning.dqn import DQNConfig
+from rp_jax.planning.loop import LoopConfig
+from rp_jax.threat.build import ThreatConfig
+from rp_jax.threat.fit import FitConfig
+
+WALL = ThreatConfig(
+    states=200_000,
+    fit=FitConfig(hidden=(64, 64, 32), steps=12_000, batch=2048, learning_rate=5e-3),
+)
+OBSTACLE = ThreatConfig(
+    states=200_000,
+    paths=64,
+    sampling="preferential",
+    prudence=0.01,
+    fit=FitConfig(hidden=(128, 128, 128), steps=12_000, batch=1024, learning_rate=3e-3),
+)
+# Appendix G.1: 100,000 states x 10,000 paths.
+PAPER_WALL = ThreatConfig(
+    states=100_000,
+    paths=10_000,
+    fit=FitConfig((100, 50), "relu", 3900, 512, 1e-2, 1e-2, cosine=False),
+)
+PAPER_OBSTACLE = ThreatConfig(
+    states=100_000,
+    paths=1_000,
+    fit=FitConfig((500, 500, 500), "relu", 4900, 512, 1e-3, 1e-2, cosine=False),
+)
+
+
+@dataclass(frozen=True)
+class Config(pipeline.Config):
+    """Settings of Jam."""
+
+    obstacles: int = 8  # while learning
+    test_obstacles: tuple[int, ...] = (3, 8, 15)  # while testing
+    wall: ThreatConfig = field(default_factory=lambda: WALL)  # threat of a wall point
+    obstacle: ThreatConfig = field(default_factory=lambda: OBSTACLE)  # threat of an obstacle
+
+
+def quick(recipe: str) -> Config:
+    """Minutes on two cores."""
+    config = Config(planning=LoopConfig(steps=1_200_000), episodes=10_000)
+    return paper(config) if recipe == "paper" else config
+
+
+def full(recipe: str) -> Config:
+    """What committed results are made with."""
+    return cli.override(quick(recipe), seeds=10 if recipe == "tuned" else 1, episodes=20_000)
+
+
+def paper(config: Config) -> Config:
+    """The paper's architectures and hyperparameters (appendix G.1, table in docs/fidelity.md)."""
+    return cli.override(
+        config, wall=PAPER_WALL, obstacle=PAPER_OBSTACLE, planning=PAPER_PLANNING
+    )
+
+
+PAPER_PLANNING = LoopConfig(
+    network="paper",
+    learner=DQNConfig(
+        gamma=0.9,
+        learning_rate=1e-3,
+        epsilon=1e-2,
+        anneal=False,
+        polyak=0.0,
+        period=1000,
+        reward_scale=1.0,
+    ),
+    steps=3_000_000,
+    num_envs=32,
+    batch=1024,  # 32 per step, as in the original
+    n_step=1,
+    replay=1_000_000,
+    replay_start=640,
+    prioritised=True,
+    explore_share=1.0,
+)
+
+
+def make_task(config: Config) -> pipeline.Task:
+    """Environments and threats, checked."""
+    if not config.test_obstacles:
+        raise ValueError("test_obstacles is (); it must name at least one count")
+    params = lambda n: jam.make_params(n, fidelity=config.fidelity)  # noqa: E731
+    return pipeline.Task(
+        name="jam",
+        env=jam,
+        train=params(config.obstacles),
+        tests={f"N={n}": params(n) for n in config.test_obstacles},
+        threats={"wall": config.wall, "obstacle": config.obstacle},
+        draw=draw,
+    )
+
+
+def draw(run: pipeline.Finished) -> None:
+    """All figures of a run, and an animation."""
+    from experiments import drawing
+    from rp_jax.plot import scenes
+
+    bar, x, folder = run.bar, run.config.x, run.folder
+    bar("", 0, 4, "curves")
+    drawing.curves_of(run)
+    zones = [(0, 0, 0.5, 0.5), (0, 2.5, 0.5, 0.5), (2.5, 0, 0.5, 0.5)]
+    scene = scenes.Scene(jam.wall_points(), zones)
+    bar("", 1, 4, "trajectories")
+    panels = []
+    for variant, test in run.task.tests.items():
+        keys = jax.random.split(pipeline.key_of(run.config.seed, pipeline.MEDIA), 20)
+        starts = jax.vmap(jam.reset, (0, None))(keys, test)
+        limit = int(test.time_limit)
+        episodes = drawing.play(run, test, starts, limit, lambda s: s.obstacles)
+        panels.append((variant, scene, episodes))
+        if variant == f"N={run.config.obstacles}" or len(panels) == 1:
+            shown = episodes
+    scenes.trajectories(panels, folder / "trajectories.png")
+    if run.pmdp.threats:
+        bar("", 2, 4, "threat maps")
+        draw_maps(run)
+    bar("", 3, 4, "animation")
+    longest = max(shown, key=lambda e: len(e.action))
+    scenes.animate(
+        scene, longest, jam.ACCELERATIONS, jam.TURNS, x, folder.parent / "animation.gif"
+    )
+    bar("", 4, 4, "")
+
+
+def draw_maps(run: pipeline.Finished) -> None:
+    """Figure 4: single-obstacle threats, and their sums for two velocities."""
+    from experiments import drawing
+    from rp_jax.plot import maps
+
+    cases = [(0.0, 0.06, 0.1), (np.pi, 0.06, 0.1), (np.pi / 2, 0.06, 0.0)]
+    titles = [
+        f"obstacle heading {np.degrees(h):.0f} deg at {v:g}, agent at {own:g}"
+        for h, v, own in cases
+    ]
+
+    def features(places: np.ndarray, i: int) -> np.ndarray:
+        heading, speed, own = cases[i]
+        rest = [np.cos(heading), np.sin(heading), speed, own]
+        return np.concatenate([places, np.tile(rest, (len(places), 1))], axis=-1)
+
+    panels = drawing.threat_of_one(run, "obstacle", titles, features)
+    maps.heat_maps(panels, run.config.x, run.folder / "threat_of_one_obstacle.png")
+    speeds = [0.1, 0.0, -0.1]
+    walls = drawing.threat_of_one(
+        run,
+        "wall",
+        [f"wall point, agent at {v:g}" for v in speeds],
+        lambda p, i: np.concatenate([p, np.full((len(p), 1), speeds[i])], axis=-1),
+    )
+    maps.heat_maps(walls, run.config.x, run.folder / "threat_of_one_wall_point.png")
+    key = pipeline.key_of(run.config.seed, pipeline.MEDIA)
+    state = jam.reset(key, run.pmdp.params)
+    velocities = {"heading 45 deg, speed 0.1": (np.pi / 4, 0.1), "heading 180 deg, speed 0.05": (np.pi, 0.05)}
+    sums = drawing.threat_of_all(run, state, (0.0, 3.0, 0.0, 3.0), velocities)
+    others = jax.tree.map(np.asarray, state.obstacles)
+
+    def decorate(axis, i: int) -> None:
+        axis.quiver(
+            *others.position.T, *(others.heading * others.speed[:, None]).T, color="#63b3ed"
+        )
+        axis.plot(*others.position.T, "o", color="#63b3ed", markersize=4)
+        axis.plot(*jam.wall_points().T, ",", color="white")
+
+    maps.heat_maps(sums, run.config.x, run.folder / "threat_of_all.png", decorate)
+
+
+PRESETS = {"quick": quick, "full": full}
+RECIPES = ("tuned", "paper")
+
+if __name__ == "__main__":
+    cli.main("experiments.jam", __doc__ or "", PRESETS, RECIPES, make_task)

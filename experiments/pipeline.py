@@ -1,0 +1,426 @@
+"""The main job, task by task: reconnaissance, threat models, planning, evaluation, figures."""
+
+import csv
+import dataclasses
+import datetime
+import io
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import rp_jax
+from experiments import console
+from rp_jax import evaluate, statistics, storage
+from rp_jax.envs.base import Env
+from rp_jax.planning import loop
+from rp_jax.planning.loop import LoopConfig
+from rp_jax.planning.networks import POOLS
+from rp_jax.planning.pmdp import PMDP
+from rp_jax.recon import labels
+from rp_jax.threat import artefact, build, report
+from rp_jax.threat.build import ThreatConfig
+from rp_jax.threat.total import total_threat
+from rp_jax.validate import number, one_of
+
+THREAT, PLANNING, EVALUATION, MEDIA = range(4)  # streams of random numbers, all apart
+CHUNKS = 30  # of a training run: points of its curves
+TABLE = (
+    "env variant method seed episodes return_mean return_ci95 uncrashed_return_mean crashes "
+    "crash_rate crash_upper95 goal_rate interventions insecure seconds_per_100_actions "
+    "train_seconds"
+).split()
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings that all tasks share."""
+
+    seeds: int = 1  # training runs, side by side in one program
+    seed: int = 0  # of the first; the others count up
+    out: Path | None = None  # folder for results; default: results/ENV-PRESET-TIME
+    threat: Path | None = None  # folder of a threat function to use again
+    x: float = 0.01  # largest admissible threat; inf switches the shield off
+    learning_penalty: float = 0.0  # taken off the reward per crash while learning
+    penalty: float = 50.0  # taken off the return per crash in the tables
+    episodes: int = 10_000  # evaluated per case
+    figures: bool = True  # draw figures and an animation
+    planning: LoopConfig = field(default_factory=LoopConfig)  # the learner
+    fidelity: str = "released"  # "released" as the published numbers, "paper" as the text
+
+    def validate(self) -> None:
+        """Raises ValueError, naming the field, if a value is out of range."""
+        number("seeds", self.seeds, least=1, most=1000, integer=True)
+        number("seed", self.seed, least=0, most=2**31 - 1001, integer=True)
+        number("x", self.x, least=0, infinite=True)
+        number("learning_penalty", self.learning_penalty, least=0)
+        number("penalty", self.penalty, least=0)
+        number("episodes", self.episodes, least=1, integer=True)
+        one_of("fidelity", self.fidelity, ("released", "paper"))
+        self.planning.validate("planning")
+
+
+class Task(NamedTuple):
+    """What distinguishes one task from another: data, and how to draw it."""
+
+    name: str
+    env: Env
+    train: Any  # environment parameters
+    tests: dict[str, Any]  # by variant, environment parameters
+    threats: dict[str, ThreatConfig]  # by kind of hazard
+    draw: Callable[[Any], None] | None  # makes the task's own figures from a `Finished`
+
+
+class Trained(NamedTuple):
+    """What planning leaves."""
+
+    params: Any  # of the Q-network, leading axis (seeds,)
+    history: list[dict[str, Any]]  # one row per chunk and seed
+    seconds: float  # without compilation
+    compile_seconds: float
+
+
+class Finished(NamedTuple):
+    """A run, for drawing."""
+
+    task: Task
+    config: Config
+    pmdp: PMDP
+    trained: Trained
+    rows: list[dict[str, Any]]
+    curves: dict[str, list[dict[str, float]]]
+    folder: Path  # for figures
+    bar: console.Bar
+
+
+def key_of(seed: int, stream: int) -> jax.Array:
+    """The key of one use of a seed; evaluation never shares one with training."""
+    return jax.random.fold_in(jax.random.key(seed), stream)
+
+
+def default_out(task: str, preset: str) -> Path:
+    """results/TASK-PRESET-TIME."""
+    now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    return Path("results") / f"{task}-{preset}-{now}"
+
+
+def learn_threats(task: Task, config: Config, folder: Path) -> tuple[dict, dict, dict]:
+    """The threat models of all kinds of hazard: loaded, or learned and saved.
+
+    Returns:
+        (models, curves, timings), the latter two empty if loaded.
+    """
+    subs = task.env.sub_rmdps(task.train)
+    if np.isinf(config.x):
+        return {}, {}, {}
+    if config.threat is not None:
+        return artefact.load(config.threat, task.name, subs), {}, {}
+    built = {}
+    keys = jax.random.split(key_of(config.seed, THREAT), len(subs))
+    for key, kind in zip(keys, sorted(subs), strict=True):
+        with console.progress(f"threat of {kind}") as bar:
+            built[kind] = build.build(key, subs[kind], task.threats[kind], config.x, bar)
+    models = {kind: b.model for kind, b in built.items()}
+    reports = {kind: b.report for kind, b in built.items()}
+    timings = {kind: b.seconds for kind, b in built.items()}
+    sums = sum_reports(key_of(config.seed, THREAT), task, config, models)
+    curves = {kind: b.curve for kind, b in built.items()}
+    about = {
+        "x": config.x,
+        "reports": reports,
+        "sums": sums,
+        "settings": {k: dataclasses.asdict(v) for k, v in task.threats.items()},
+        "seed": config.seed,
+        "version": rp_jax.__version__,
+    }
+    artefact.save(folder / "threat", task.name, models, subs, about)
+    rows = [{"hazard": kind, "of": "one", **found} for kind, found in reports.items()]
+    rows += [{"hazard": kind, "of": "sum", **found} for kind, found in sums.items()]
+    columns = ("hazard of mae rmse bias spearman unsafe_called_safe safe_called_unsafe").split()
+    console.table(f"threat models against fresh labels (x = {config.x:g})", rows, columns)
+    storage.write_json(folder / "threat" / "report.json", rows)
+    storage.write_json(folder / "threat" / "curves.json", curves)
+    return models, curves, timings
+
+
+def sum_reports(key: jax.Array, task: Task, config: Config, models: Mapping) -> dict:
+    """By kind of hazard, the models' sums against accurate ones on states of the task."""
+    walk, *keys = jax.random.split(key, 1 + len(models))
+    pmdp = make_pmdp(task, config, models, task.train)
+    states = jax.jit(evaluate.visited_states, static_argnums=2)(walk, pmdp, 256)
+    hazards = jax.jit(jax.vmap(task.env.hazards, (0, None)))(states, task.train)
+    subs = task.env.sub_rmdps(task.train)
+    found = {}
+    for kind, key in zip(sorted(models), keys, strict=True):
+        estimator = labels.best_estimator(subs[kind], task.threats[kind].test_paths)
+        with console.progress(f"sum over {kind}s") as bar:
+            bar("", 0, 1)
+            true = report.labelled_sum(key, states.agent, hazards[kind], subs[kind], estimator)
+            only = {kind: models[kind]}
+            said = total_threat(only, states.agent, {kind: hazards[kind]})
+            bar("", 1, 1)
+        found[kind] = report.compare(np.asarray(said), true, config.x)
+    return found
+
+
+def make_pmdp(task: Task, config: Config, models: Mapping, params: Any) -> PMDP:
+    """The P-MDP of one variant of the task."""
+    return PMDP(
+        params=params,
+        threats=dict(models),
+        x=jnp.asarray(config.x, jnp.float32),
+        penalty=jnp.asarray(config.learning_penalty, jnp.float32),
+        env=task.env,
+        pool=POOLS[config.planning.network],
+    )
+
+
+def method_name(config: Config) -> str:
+    """RP with its threshold, or DQN with its penalty."""
+    if np.isinf(config.x):
+        return f"DQN (penalty {config.learning_penalty:g})"
+    name = f"RP (x={config.x:g})"
+    return name if config.learning_penalty == 0 else f"{name[:-1]}, {config.learning_penalty:g})"
+
+
+def plan(task: Task, config: Config, models: Mapping, folder: Path) -> Trained:
+    """Trains all seeds as one program; writes metrics.jsonl as it goes."""
+    planning = config.planning
+    length = max(1, planning.iterations // CHUNKS)
+    chunks = -(-planning.iterations // length)
+    updates = chunks * length * planning.updates
+    learner = dataclasses.replace(planning.learner, total_updates=updates)
+    planning = dataclasses.replace(planning, learner=learner)
+    pmdp = make_pmdp(task, config, models, task.train)
+    keys = jnp.stack([key_of(config.seed + i, PLANNING) for i in range(config.seeds)])
+    console.console.print(
+        f"planning: {config.seeds} seed(s) x {chunks * length * planning.num_envs:,} steps, "
+        f"{planning.samples_per_step:g} samples replayed per step, {method_name(config)}"
+    )
+    history: list[dict[str, Any]] = []
+    with console.progress("planning") as bar:
+        bar("", 0, chunks, "compiling")
+        began = time.perf_counter()
+        start = jax.jit(jax.vmap(loop.init, (0, None, None)), static_argnums=2)
+        start = start.lower(keys, pmdp, planning).compile()
+        step = jax.jit(
+            jax.vmap(loop.chunk, (0, None, None, None)), static_argnums=(2, 3), donate_argnums=0
+        )
+        shapes = jax.tree.map(lambda s: jax.ShapeDtypeStruct(s.shape, s.dtype), start.out_info[0])
+        step = step.lower(shapes, pmdp, planning, length).compile()
+        compiled = time.perf_counter()
+        state, metrics = start(keys, pmdp)
+        for i in range(chunks):
+            state, new = step(state, pmdp)
+            metrics = jax.tree.map(jnp.add, metrics, new) if i == 0 else new
+            rows = _chunk_rows(metrics, config, length * planning.updates, history)
+            history += rows
+            seconds = time.perf_counter() - compiled
+            for row in rows:
+                row["seconds"] = seconds
+            _append_lines(folder / "metrics.jsonl", rows)
+            bar("", i + 1, chunks, _note(rows))
+    about = {"method": method_name(config), "seeds": config.seeds, "seed": config.seed}
+    storage.save(folder / "agent", "Q-network", state.learner.params, about)
+    return Trained(state.learner.params, history, seconds, compiled - began)
+
+
+def _chunk_rows(metrics, config: Config, updates: int, history: Sequence) -> list[dict]:
+    """One row per seed of what happened in a chunk."""
+    sums = {name: np.asarray(value) for name, value in metrics._asdict().items()}
+    rows = []
+    for i in range(config.seeds):
+        of = {name: float(value[i]) for name, value in sums.items()}
+        before = [row["steps"] for row in history if row["seed"] == config.seed + i]
+        ended = max(of["episodes"], 1.0)
+        rows.append(
+            {
+                "seed": config.seed + i,
+                "steps": int(of["steps"]) + (before[-1] if before else 0),
+                "episodes": int(of["episodes"]),
+                "return_mean": (of["score"] - config.penalty * of["crashes"]) / ended
+                if of["episodes"]
+                else float("nan"),
+                "crashes": int(of["crashes"]),
+                "goal_rate": of["goals"] / ended,
+                "insecure": of["insecure"] / of["steps"],
+                "inadmissible": int(of["inadmissible"]),
+                "loss": of["loss"] / updates,
+            }
+        )
+    return rows
+
+
+def _note(rows: Sequence[Mapping]) -> str:
+    returns = np.mean([row["return_mean"] for row in rows])
+    crashes, ended = sum(r["crashes"] for r in rows), sum(r["episodes"] for r in rows)
+    return f"return {returns:.1f}, {crashes} crashes in {ended} episodes"
+
+
+def _append_lines(path: Path, rows: Sequence[Mapping]) -> None:
+    with path.open("a") as file:
+        for row in rows:
+            plain = {k: None if v != v else v for k, v in row.items()}
+            file.write(json.dumps(plain) + "\n")
+
+
+def evaluate_all(
+    task: Task, config: Config, models: Mapping, trained: Trained
+) -> list[dict[str, Any]]:
+    """One row per variant and seed."""
+    pmdp = make_pmdp(task, config, models, task.train)
+    network = loop.make_network(config.planning, pmdp)
+    batch = min(1000, config.episodes)
+
+    def one(key, params, pmdp):
+        values = evaluate.greedy(network, params)
+        return evaluate.run_episodes(key, pmdp, values, config.episodes, batch=batch)
+
+    everyone = jax.jit(jax.vmap(one, (0, 0, None)))
+    keys = jnp.stack([key_of(config.seed + i, EVALUATION) for i in range(config.seeds)])
+    rows = []
+    with console.progress("evaluation") as bar:
+        for done, (variant, params) in enumerate(task.tests.items()):
+            bar("", done, len(task.tests), f"{variant}: {config.episodes:,} episodes a seed")
+            this = pmdp.replace(params=params)
+            episodes = jax.tree.map(np.asarray, everyone(keys, trained.params, this))
+            seconds = action_seconds(this, network, trained.params)
+            for i in range(config.seeds):
+                found = evaluate.summarise(
+                    jax.tree.map(lambda a, i=i: a[i], episodes), config.penalty
+                )
+                rows.append(
+                    {
+                        "env": task.name,
+                        "variant": variant,
+                        "method": method_name(config),
+                        "seed": config.seed + i,
+                        **found,
+                        "seconds_per_100_actions": seconds,
+                        "train_seconds": trained.seconds,
+                    }
+                )
+            bar("", done + 1, len(task.tests))
+    return rows
+
+
+def action_seconds(pmdp: PMDP, network: Any, params: Any) -> float:
+    """Wall time of 100 decisions one after another, observation and threat included."""
+    weights = jax.tree.map(lambda a: a[0], params)
+    state = jax.vmap(pmdp.env.reset, (0, None))(jax.random.split(jax.random.key(0), 1), pmdp.params)
+
+    @jax.jit
+    def act(states, weights, pmdp):
+        percept = pmdp.perceive(states)
+        values = network.apply(weights, percept.encoded)
+        return jnp.argmax(jnp.where(percept.admissible, values, -jnp.inf), axis=-1)
+
+    act(state, weights, pmdp).block_until_ready()
+    began = time.perf_counter()
+    for _ in range(100):
+        act(state, weights, pmdp).block_until_ready()
+    return time.perf_counter() - began
+
+
+def over_seeds(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Per variant, means and intervals over the seeds, and all crashes together."""
+    found = []
+    for variant in dict.fromkeys(row["variant"] for row in rows):
+        of = [row for row in rows if row["variant"] == variant]
+        mean, width = statistics.mean_interval(np.asarray([row["return_mean"] for row in of]))
+        n, k = sum(r["episodes"] for r in of), sum(r["crashes"] for r in of)
+        low, high = statistics.clopper_pearson(k, n)
+        found.append(
+            {
+                "variant": variant,
+                "seeds": len(of),
+                "return_mean": mean,
+                "return_ci95": width,
+                "crashes": k,
+                "episodes": n,
+                "crash_rate": k / n,
+                "crash_lower95": low,
+                "crash_upper95": high,
+            }
+        )
+    return found
+
+
+def write_tables(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """table.json, table.csv, and the same on the terminal."""
+    storage.write_json(folder / "table.json", rows)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, TABLE, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    storage.write_bytes(folder / "table.csv", text.getvalue().encode())
+    columns = [c for c in TABLE if c not in ("env", "method")]
+    console.table(f"{rows[0]['env']}: {rows[0]['method']}", rows, columns)
+    if len({row["seed"] for row in rows}) > 1:
+        summary = over_seeds(rows)
+        storage.write_json(folder / "summary.json", summary)
+        console.table("over seeds", summary, list(summary[0]))
+
+
+def run(make_task: Callable[[Any], Task], config: Config, preset: str) -> Path:
+    """The whole job. Everything that can be wrong with the input is found before any long work.
+
+    Returns:
+        the folder of results.
+
+    Raises:
+        ValueError: a setting is out of range, or a file cannot be used.
+    """
+    config.validate()
+    task = make_task(config)
+    for kind, threat in task.threats.items():
+        threat.validate(kind)
+    if config.threat is not None:
+        artefact.load(config.threat, task.name, task.env.sub_rmdps(task.train))
+    folder = storage.new_folder(config.out or default_out(task.name, preset))
+    began = time.perf_counter()
+    settings = {
+        "preset": preset,
+        "task": task.name,
+        **dataclasses.asdict(config),
+        "versions": {"rp_jax": rp_jax.__version__, "jax": jax.__version__},
+        "device": str(jax.devices()[0]),
+    }
+    storage.write_json(folder / "config.json", settings)
+    models, curves, timings = learn_threats(task, config, folder)
+    recon_seconds = time.perf_counter() - began
+    trained = plan(task, config, models, folder)
+    rows = evaluate_all(task, config, models, trained)
+    write_tables(folder, rows)
+    inadmissible = sum(row["inadmissible"] for row in trained.history)
+    steps = sum(row["steps"] for row in trained.history[-config.seeds :])
+    crashes = sum(row["crashes"] for row in trained.history)
+    seconds = {
+        "reconnaissance": recon_seconds,
+        "reconnaissance_parts": timings,
+        "planning": trained.seconds,
+        "planning_compilation": trained.compile_seconds,
+        "total_before_figures": time.perf_counter() - began,
+    }
+    storage.write_json(
+        folder / "training.json",
+        {"steps": steps, "crashes": crashes, "inadmissible": inadmissible, "seconds": seconds},
+    )
+    console.console.print(
+        f"training: {steps:,} steps, {crashes} crashes, {inadmissible} inadmissible actions "
+        f"taken; {trained.seconds:.1f} s after {trained.compile_seconds:.1f} s of compilation"
+    )
+    if config.figures and task.draw is not None:
+        (folder / "figures").mkdir()
+        with console.progress("figures") as bar:
+            pmdp = make_pmdp(task, config, models, task.train)
+            figures = folder / "figures"
+            task.draw(Finished(task, config, pmdp, trained, rows, curves, figures, bar))
+    console.console.print(f"results: {folder}")
+    return folder

@@ -1,0 +1,83 @@
+"""Learning curves."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+
+from rp_jax import statistics
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+BLUE, RED, GREY = "#2b6cb0", "#c53030", "#718096"
+
+
+def learning_curves(history: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
+    """Return, crash rate and states without an admissible action, against agent steps.
+
+    Args:
+        history: one row per chunk and seed, as in metrics.jsonl.
+        title: of the figure.
+        path: of the PNG.
+    """
+    steps = sorted({row["steps"] for row in history})
+    of = {s: [row for row in history if row["steps"] == s] for s in steps}
+    figure, axes = plt.subplots(3, 1, figsize=(7, 7.5), sharex=True, layout="constrained")
+    seeds = sorted({row["seed"] for row in history})
+    for seed in seeds:
+        mine = [row for row in history if row["seed"] == seed and row["episodes"]]
+        axes[0].plot(
+            [r["steps"] for r in mine], [r["return_mean"] for r in mine], color=BLUE, alpha=0.25
+        )
+    means = [
+        (s, np.mean([r["return_mean"] for r in of[s] if r["episodes"]]))
+        for s in steps
+        if any(r["episodes"] for r in of[s])
+    ]
+    axes[0].plot(*zip(*means, strict=True), color=BLUE, label=f"mean of {len(seeds)} seed(s)")
+    axes[0].set_ylabel("return while exploring\n(crash penalty included)")
+    axes[0].legend(loc="lower right")
+    rates, low, high = [], [], []
+    ended = [s for s in steps if sum(r["episodes"] for r in of[s])]
+    for s in ended:
+        k, n = (sum(r[name] for r in of[s]) for name in ("crashes", "episodes"))
+        bounds = statistics.clopper_pearson(k, n)
+        rates.append(k / n)
+        low.append(bounds[0])
+        high.append(bounds[1])
+    axes[1].plot(ended, rates, color=RED)
+    axes[1].fill_between(ended, low, high, color=RED, alpha=0.2, label="95 % Clopper-Pearson")
+    axes[1].set_ylabel("crashes per episode\nwhile exploring")
+    axes[1].set_ylim(bottom=0)
+    axes[1].legend(loc="upper right")
+    axes[2].plot(steps, [np.mean([r["insecure"] for r in of[s]]) for s in steps], color=GREY)
+    axes[2].set_ylabel("share of states with no\nadmissible action")
+    axes[2].set_ylim(bottom=0)
+    axes[2].set_xlabel("agent steps")
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    figure.suptitle(title)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def fit_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path) -> None:
+    """Training and validation loss of the threat models, by kind of hazard."""
+    figure, axes = plt.subplots(
+        1, len(curves), figsize=(4.5 * len(curves), 3.4), layout="constrained", squeeze=False
+    )
+    for axis, (kind, rows) in zip(axes[0], curves.items(), strict=True):
+        steps = [row["step"] for row in rows]
+        axis.plot(steps, [row["loss"] for row in rows], color=BLUE, label="training")
+        held = [row["validation_loss"] for row in rows]
+        axis.plot(steps, held, color=RED, label="validation")
+        axis.set_title(f"threat of one {kind}")
+        axis.set_xlabel("gradient steps")
+        axis.set_ylabel("cross entropy")
+        axis.legend()
+        axis.grid(alpha=0.3)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)

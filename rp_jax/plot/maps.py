@@ -1,0 +1,62 @@
+"""Threat heat maps (figure 4b to 4d)."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib
+import numpy as np
+from matplotlib.colors import LogNorm
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+FLOOR = 1e-4  # smaller threats look alike
+
+
+class Panel(NamedTuple):
+    """One heat map."""
+
+    title: str
+    threat: np.ndarray  # (ny, nx)
+    extent: tuple[float, float, float, float]  # left, right, bottom, top, room units
+
+
+def heat_maps(panels: Sequence[Panel], x: float, path: Path, decorate=None) -> None:
+    """Threats in colour on a logarithmic scale; a line where they equal x.
+
+    Args:
+        panels: side by side.
+        x: the threshold.
+        path: of the PNG.
+        decorate: called with (axis, index) to add to a panel.
+    """
+    columns = min(3, len(panels))
+    lines = -(-len(panels) // columns)
+    figure, axes = plt.subplots(
+        lines, columns, figsize=(4.6 * columns, 3.9 * lines), layout="constrained", squeeze=False
+    )
+    image = None
+    for i, axis in enumerate(axes.flat):
+        if i >= len(panels):
+            axis.axis("off")
+            continue
+        panel = panels[i]
+        image = axis.imshow(
+            np.maximum(panel.threat, FLOOR),
+            origin="lower",
+            extent=panel.extent,
+            norm=LogNorm(FLOOR, 1.0, clip=True),
+            cmap="inferno",
+        )
+        if 0 < x and panel.threat.min() < x < panel.threat.max():
+            axis.contour(
+                panel.threat, [x], extent=panel.extent, origin="lower", colors="cyan", linewidths=1
+            )
+        axis.set_title(panel.title, fontsize=10)
+        axis.set_aspect("equal")
+        if decorate is not None:
+            decorate(axis, i)
+    figure.colorbar(image, ax=axes, label=f"threat (cyan: x = {x:g})", shrink=0.8)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)

@@ -1,0 +1,146 @@
+"""Where vehicles went, and an animation of an episode with the threat of every action."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.colors import LogNorm
+from matplotlib.patches import Circle, Rectangle
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+AGENT, OBSTACLE, ZONE = "#d69e2e", "#63b3ed", "#c6f6d5"
+
+
+class Scene(NamedTuple):
+    """What stands still: drawn under everything else."""
+
+    walls: np.ndarray  # (w, 2)
+    zones: Sequence[tuple[float, float, float, float]] = ()  # x, y, width, height
+    radius: float = 0.1  # of the vehicles
+
+
+class Episode(NamedTuple):
+    """An episode step by step, up to its end."""
+
+    position: np.ndarray  # (t, 2)
+    heading: np.ndarray  # (t, 2)
+    obstacles: np.ndarray  # (t, n, 2); n may be 0
+    obstacle_headings: np.ndarray  # (t, n, 2)
+    action: np.ndarray  # (t,)
+    threat: np.ndarray  # (t, A)
+    admissible: np.ndarray  # (t, A)
+    secure: np.ndarray  # (t,)
+    crashed: bool
+
+
+def draw_scene(axis: Any, scene: Scene) -> None:
+    """Walls as dots, safety zones shaded."""
+    for x, y, width, height in scene.zones:
+        axis.add_patch(Rectangle((x, y), width, height, color=ZONE, zorder=0))
+    axis.plot(*scene.walls.T, ".", color="#2d3748", markersize=1.5, zorder=1)
+    axis.set_aspect("equal")
+    axis.set_xticks([])
+    axis.set_yticks([])
+
+
+def trajectories(
+    panels: Sequence[tuple[str, Scene, Sequence[Episode]]], path: Path
+) -> None:
+    """Paths of several episodes per panel (figure 6); S marks the start, red crosses crashes."""
+    figure, axes = plt.subplots(
+        1, len(panels), figsize=(5 * len(panels), 4.6), layout="constrained", squeeze=False
+    )
+    for axis, (title, scene, episodes) in zip(axes[0], panels, strict=True):
+        draw_scene(axis, scene)
+        crashes = 0
+        for episode in episodes:
+            axis.plot(*episode.position.T, color="#2b6cb0", alpha=0.6, linewidth=1)
+            axis.annotate("S", episode.position[0], fontsize=8, ha="center", va="center")
+            if episode.crashed:
+                crashes += 1
+                axis.plot(*episode.position[-1], "x", color="#c53030", markersize=9, zorder=5)
+        axis.set_title(f"{title}: {crashes} of {len(episodes)} episodes crashed", fontsize=10)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def animate(
+    scene: Scene,
+    episode: Episode,
+    accelerations: Sequence[float],
+    turns: Sequence[float],
+    x: float,
+    path: Path,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """An animated GIF: the world on the left, the threat of each action on the right.
+
+    Inadmissible actions are crossed out, the chosen one is framed.
+
+    Args:
+        scene: what stands still.
+        episode: what moves.
+        accelerations: of the action table, one row each.
+        turns: of the action table, one column each, right to left in the table.
+        x: the threshold.
+        path: of the GIF.
+        on_progress: called with (frames done, frames).
+    """
+    frames = len(episode.action)
+    shape = (len(accelerations), len(turns))
+    figure, (world, table) = plt.subplots(
+        1, 2, figsize=(9, 4.4), width_ratios=(1.25, 1), layout="constrained"
+    )
+    draw_scene(world, scene)
+    (trail,) = world.plot([], [], color=AGENT, linewidth=1)
+    others = [
+        world.add_patch(Circle((0, 0), scene.radius, color=OBSTACLE))
+        for _ in range(episode.obstacles.shape[1])
+    ]
+    agent = world.add_patch(Circle((0, 0), scene.radius, color=AGENT, zorder=4))
+    noses = [world.plot([], [], color="black", linewidth=1, zorder=5)[0] for _ in range(1 + len(others))]
+    # The leftmost turn stands leftmost, as seen by the driver.
+    image = table.imshow(np.ones(shape), norm=LogNorm(1e-4, 1, clip=True), cmap="inferno")
+    table.set_xticks(range(shape[1]), [f"{t:+.2f}" for t in turns[::-1]])
+    table.set_yticks(range(shape[0]), [f"{a:+.2f}" for a in accelerations])
+    table.set_xlabel("turn, radians (left is positive)")
+    table.set_ylabel("acceleration")
+    figure.colorbar(image, ax=table, label="threat", shrink=0.7)
+    crosses = [
+        [table.text(j, i, "", ha="center", va="center", color="white") for j in range(shape[1])]
+        for i in range(shape[0])
+    ]
+    frame = table.add_patch(Rectangle((0, 0), 1, 1, fill=False, edgecolor="cyan", linewidth=3))
+
+    def show(t: int) -> None:
+        trail.set_data(*episode.position[: t + 1].T)
+        agent.center = episode.position[t]
+        bodies = [(episode.position[t], episode.heading[t])]
+        for k, patch in enumerate(others):
+            patch.center = episode.obstacles[t, k]
+            bodies.append((episode.obstacles[t, k], episode.obstacle_headings[t, k]))
+        for nose, (where, way) in zip(noses, bodies, strict=True):
+            tip = where + way * scene.radius * 1.4
+            nose.set_data([where[0], tip[0]], [where[1], tip[1]])
+        threat = episode.threat[t].reshape(shape)[:, ::-1]
+        allowed = episode.admissible[t].reshape(shape)[:, ::-1]
+        image.set_data(np.maximum(threat, 1e-4))
+        for i in range(shape[0]):
+            for j in range(shape[1]):
+                crosses[i][j].set_text("" if allowed[i, j] else "x")
+        row, column = divmod(int(episode.action[t]), shape[1])
+        frame.set_xy((shape[1] - 1 - column - 0.5, row - 0.5))
+        state = "" if episode.secure[t] else ", none admissible: least threat"
+        table.set_title(f"x: threat above {x:g}{state}", fontsize=10)
+        world.set_title(f"step {t}" + (", CRASH" if episode.crashed and t == frames - 1 else ""))
+        if on_progress:
+            on_progress(t + 1, frames)
+
+    animation = FuncAnimation(figure, show, frames=frames, init_func=lambda: None)
+    animation.save(path, writer=PillowWriter(fps=12), dpi=80)
+    plt.close(figure)

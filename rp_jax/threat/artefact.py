@@ -1,0 +1,100 @@
+"""A learned threat function as a file of its own, to be used again with other x, tracks, counts."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rp_jax import storage
+from rp_jax.hazards import SubRMDP
+from rp_jax.threat.model import ACTIVATIONS, ThreatModel, ThreatNetwork
+
+KIND = "threat function"
+WIDEST = 4096  # units of a layer
+
+
+def save(
+    folder: Path,
+    environment: str,
+    models: Mapping[str, ThreatModel],
+    subs: Mapping[str, SubRMDP],
+    about: Mapping[str, Any],
+) -> None:
+    """Saves the models of all kinds of hazard, with the sub-R-MDPs they hold for.
+
+    Args:
+        folder: created if missing.
+        environment: name that `load` asks for again.
+        models: by kind.
+        subs: by kind.
+        about: anything else worth keeping, such as reports.
+    """
+    networks = {
+        kind: {"hidden": model.network.hidden, "activation": model.network.activation}
+        for kind, model in models.items()
+    }
+    tree = {kind: {"model": models[kind], "sub": subs[kind]} for kind in models}
+    facts = {"environment": environment, "networks": networks, **about}
+    storage.save(folder, KIND, tree, facts)
+
+
+def load(folder: Path, environment: str, subs: Mapping[str, SubRMDP]) -> dict[str, ThreatModel]:
+    """The models that `save` wrote.
+
+    Raises:
+        storage.StorageError: the file is damaged, or holds for another environment, other
+            dynamics, another baseline policy or other hazards.
+    """
+    about = storage.read_manifest(folder, KIND)["about"]
+    if about.get("environment") != environment:
+        raise storage.StorageError(
+            f"{folder}: environment is {about.get('environment')!r}; it must be {environment!r}"
+        )
+    networks = about.get("networks")
+    if not isinstance(networks, dict) or set(networks) != set(subs):
+        kinds = sorted(networks) if isinstance(networks, dict) else networks
+        raise storage.StorageError(f"{folder}: hazards are {kinds}; they must be {sorted(subs)}")
+    like = {
+        kind: {"model": _blank(folder, kind, networks[kind], sub), "sub": sub}
+        for kind, sub in subs.items()
+    }
+    tree = storage.load(folder, KIND, like)
+    for kind, sub in subs.items():
+        wanted, found = storage.leaves(sub), storage.leaves(tree[kind]["sub"])
+        for name, value in wanted.items():
+            if not np.allclose(value, found[name], rtol=1e-5, atol=1e-7):
+                raise storage.StorageError(
+                    f"{folder}: {kind}: {name} is {found[name].tolist()}; for this environment "
+                    f"it must be {value.tolist()}"
+                )
+    return {kind: tree[kind]["model"] for kind in subs}
+
+
+def _blank(folder: Path, kind: str, facts: Any, sub: SubRMDP) -> ThreatModel:
+    """A model of the right structure, whose arrays are to be replaced."""
+    hidden = facts.get("hidden") if isinstance(facts, dict) else None
+    good = isinstance(hidden, list) and all(
+        isinstance(width, int) and 0 < width <= WIDEST for width in hidden
+    )
+    if not good or len(hidden) > 16:
+        raise storage.StorageError(
+            f"{folder}: {kind}: hidden is {hidden!r}; it must list up to 16 widths of at most "
+            f"{WIDEST}"
+        )
+    if facts.get("activation") not in ACTIVATIONS:
+        raise storage.StorageError(
+            f"{folder}: {kind}: activation is {facts.get('activation')!r}; it must be one of "
+            f"{sorted(ACTIVATIONS)}"
+        )
+    num_actions = sub.agent.actions.acceleration.shape[0]
+    network = ThreatNetwork(tuple(hidden), num_actions, facts["activation"])
+    features = jax.eval_shape(
+        lambda key: sub.source.features(*sub.source.sample(key, sub.agent)), jax.random.key(0)
+    )
+    shapes = jax.eval_shape(network.init, jax.random.key(0), features)
+    params = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), shapes)
+    scale = np.zeros(features.shape, features.dtype)
+    return ThreatModel(sub.source, params, scale, jnp.zeros(()), network)

@@ -1,0 +1,72 @@
+"""How good a threat model is, where it matters: single hazards, and the sum over them."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy import stats
+
+from rp_jax.envs.base import Hazards
+from rp_jax.recon import labels
+from rp_jax.threat.model import ThreatModel
+
+
+def compare(predicted: np.ndarray, true: np.ndarray, x: float) -> dict[str, float]:
+    """Errors of predicted against true threats, arrays of one shape, and decisions at x.
+
+    Returns:
+        mae, rmse, spearman (nan if either is constant); unsafe_called_safe: of the pairs truly
+        above x, the share predicted at most x; safe_called_unsafe: of the pairs truly at most x,
+        the share predicted above; and the number of pairs of either kind.
+    """
+    predicted, true = np.ravel(predicted).astype(float), np.ravel(true).astype(float)
+    error = predicted - true
+    unsafe, called = true > x, predicted > x
+    constant = np.ptp(predicted) == 0 or np.ptp(true) == 0
+    return {
+        "mae": float(np.abs(error).mean()),
+        "rmse": float(np.sqrt(np.square(error).mean())),
+        "bias": float(error.mean()),
+        "spearman": float("nan") if constant else float(stats.spearmanr(predicted, true)[0]),
+        "unsafe": int(unsafe.sum()),
+        "safe": int((~unsafe).sum()),
+        "unsafe_called_safe": float((unsafe & ~called).sum() / max(1, unsafe.sum())),
+        "safe_called_unsafe": float((~unsafe & called).sum() / max(1, (~unsafe).sum())),
+    }
+
+
+def predict(model: ThreatModel, features: Array) -> Array:
+    """(n, A) threats of features (n, F); 0 outside the window, as `total_threat` has it."""
+    inside = model.source.window.contains(features[:, :2])
+    return jnp.where(inside[:, None], model(features), 0.0)
+
+
+def labelled_sum(
+    key: Array, agents: Any, hazards: Hazards, sub: Any, estimator: labels.Estimator
+) -> np.ndarray:
+    """(B, A) sum over hazards of their estimated threats: what a model's sum should be.
+
+    Args:
+        key: of the estimator.
+        agents: leading axis (B,).
+        hazards: of one kind, leading axes (B, n).
+        sub: their sub-R-MDP.
+        estimator: labels a single (agent, hazard).
+    """
+    inside = np.asarray(_inside(agents, hazards, sub))
+    row, column = np.nonzero(inside)
+    total = np.zeros((inside.shape[0], sub.agent.actions.acceleration.shape[0]))
+    if len(row):
+        agent = jax.tree.map(lambda a: a[row], agents)
+        hazard = jax.tree.map(lambda a: a[row, column], hazards.state)
+        found = labels.label(key, agent, hazard, sub, estimator)
+        np.add.at(total, row, np.asarray(found.threat, float))
+    return total
+
+
+@jax.jit
+def _inside(agents: Any, hazards: Hazards, sub: Any) -> Array:
+    features = jax.vmap(jax.vmap(sub.source.features, (None, 0)))(agents, hazards.state)
+    return sub.source.window.contains(features[..., :2]) & hazards.present

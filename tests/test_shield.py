@@ -1,0 +1,144 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy import stats
+
+from rp_jax.shield import (
+    from_bits,
+    greedy_eta,
+    masked_argmax,
+    masked_max,
+    masked_sample,
+    shield,
+    to_bits,
+)
+
+A = 5
+# Few distinct values, so that ties and equality with the threshold come up.
+some = st.sampled_from([0.0, 0.01, 0.1, 0.5, 1.0, 2.5])
+finite = hnp.arrays(np.float32, A, elements=some.map(np.float32))
+threats = hnp.arrays(np.float32, A, elements=st.one_of(some, st.just(np.nan)).map(np.float32))
+masks = hnp.arrays(bool, A)
+thresholds = st.one_of(some, st.just(np.inf), st.just(-1.0)).map(np.float32)
+protect = jax.jit(shield)
+SUBSETS = np.asarray([[bool(i >> a & 1) for a in range(A)] for i in range(1, 2**A)])
+
+
+@given(threats, thresholds)
+def test_the_admissible_set_is_never_empty(threat, x):
+    assert protect(threat, x).admissible.any()
+
+
+@given(threats, thresholds)
+def test_a_secure_state_admits_exactly_the_actions_within_the_threshold(threat, x):
+    admissible, secure = protect(threat, x)
+    within = threat <= x
+    assert secure == within.any()
+    if secure:
+        np.testing.assert_array_equal(admissible, within)
+
+
+@given(threats, thresholds)
+def test_an_insecure_state_admits_the_least_threatening_action_alone(threat, x):
+    admissible, secure = protect(threat, x)
+    assume(not secure)
+    best = 0 if np.isnan(threat).all() else np.nanargmin(threat)
+    np.testing.assert_array_equal(admissible, np.arange(A) == best)
+    assert greedy_eta(threat) == best
+
+
+@given(finite)
+def test_an_infinite_threshold_admits_every_action(threat):
+    admissible, secure = protect(threat, np.inf)
+    assert admissible.all()
+    assert secure
+
+
+@given(threats, thresholds)
+def test_a_threat_that_is_nan_is_never_admissible_unless_all_are(threat, x):
+    assume(not np.isnan(threat).all())
+    assert not (np.asarray(protect(threat, x).admissible) & np.isnan(threat)).any()
+
+
+@given(thresholds)
+def test_of_threats_that_are_all_nan_the_first_action_remains(x):
+    admissible, secure = protect(np.full(A, np.nan, np.float32), x)
+    np.testing.assert_array_equal(admissible, np.arange(A) == 0)
+    assert not secure
+
+
+def test_an_action_exactly_at_the_threshold_is_admissible():
+    at = jnp.float32(0.01)
+    above = jnp.nextafter(at, jnp.float32(1))
+    admissible = shield(jnp.stack([above, at, jnp.nextafter(at, jnp.float32(0))]), at).admissible
+    np.testing.assert_array_equal(admissible, [False, True, True])
+
+
+def test_of_equally_small_threats_the_first_is_greedy():
+    threat = jnp.asarray([0.7, 0.3, 0.5, 0.3])
+    assert greedy_eta(threat) == 1
+    np.testing.assert_array_equal(shield(threat, 0.1).admissible, [False, True, False, False])
+
+
+@given(finite, some, some)
+def test_a_larger_threshold_never_admits_less_in_a_secure_state(threat, x, y):
+    low, high = sorted((np.float32(x), np.float32(y)))
+    small, large = protect(threat, low), protect(threat, high)
+    assume(small.secure)
+    assert (np.asarray(large.admissible) | ~np.asarray(small.admissible)).all()
+
+
+def test_the_threshold_can_be_swept_by_vmap():
+    threat = jnp.asarray([0.0, 0.2, 0.4])
+    admissible = jax.vmap(shield, (None, 0))(threat, jnp.asarray([0.1, 0.3, jnp.inf])).admissible
+    np.testing.assert_array_equal(admissible, [[1, 0, 0], [1, 1, 0], [1, 1, 1]])
+
+
+@given(finite, masks)
+def test_the_masked_max_and_its_argument_lie_inside_the_mask(values, mask):
+    assume(mask.any())
+    best = int(masked_argmax(values, mask))
+    assert mask[best]
+    assert masked_max(values, mask) == values[mask].max() == values[best]
+    assert best == np.flatnonzero(mask & (values == values[mask].max()))[0]
+
+
+def test_the_mask_hides_even_the_greatest_value():
+    values, mask = jnp.asarray([9.0, -3.0, -2.0]), jnp.asarray([False, True, True])
+    assert masked_max(values, mask) == -2.0
+    assert masked_argmax(values, mask) == 2
+
+
+def test_samples_are_uniform_over_every_mask():
+    keys = jax.random.split(jax.random.key(0), 3000)
+    draw = jax.jit(jax.vmap(jax.vmap(masked_sample, (0, None)), (None, 0)))
+    drawn = np.asarray(draw(keys, jnp.asarray(SUBSETS)))
+    for row, mask in zip(drawn, SUBSETS, strict=True):
+        counts = np.bincount(row, minlength=A)
+        assert counts[~mask].sum() == 0
+        assert mask.sum() == 1 or stats.chisquare(counts[mask]).pvalue > 1e-4
+
+
+def test_a_mask_of_one_action_leaves_no_choice():
+    for action in range(A):
+        assert masked_sample(jax.random.key(action), jnp.arange(A) == action) == action
+
+
+@pytest.mark.parametrize("actions", [1, A, 15, 31])
+def test_masks_survive_the_round_trip_through_bits(actions):
+    masks = np.random.default_rng(actions).random((200, actions)) < 0.5
+    masks[:2] = [[False] * actions, [True] * actions]
+    bits = jax.vmap(to_bits)(jnp.asarray(masks))
+    assert bits.dtype == jnp.int32
+    back = jax.vmap(from_bits, (0, None))(bits, actions)
+    assert back.dtype == bool
+    np.testing.assert_array_equal(back, masks)
+
+
+def test_different_masks_have_different_bits():
+    bits = jax.vmap(to_bits)(jnp.asarray(SUBSETS))
+    np.testing.assert_array_equal(bits, np.arange(1, 2**A))

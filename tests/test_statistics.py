@@ -1,0 +1,109 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from rp_jax.statistics import clopper_pearson, mean_interval, upper_bound
+
+rates = st.integers(1, 300).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
+
+
+@given(rates, st.floats(0.5, 0.999))
+def test_the_interval_of_a_rate_is_that_of_scipy(rate, confidence):
+    k, n = rate
+    reference = stats.binomtest(k, n).proportion_ci(confidence, method="exact")
+    expected = (reference.low, reference.high)
+    np.testing.assert_allclose(clopper_pearson(k, n, confidence), expected, atol=1e-6)
+
+
+@given(rates, st.floats(0.5, 0.999))
+def test_the_upper_bound_of_a_rate_is_that_of_scipy(rate, confidence):
+    k, n = rate
+    reference = stats.binomtest(k, n, alternative="less").proportion_ci(confidence, method="exact")
+    np.testing.assert_allclose(upper_bound(k, n, confidence), reference.high, atol=1e-6)
+
+
+def test_what_no_event_in_100_and_in_2995_episodes_excludes():
+    assert 0.029 < upper_bound(0, 100) < 0.03
+    assert 0.0009 < upper_bound(0, 2995) < 0.001
+    assert upper_bound(0, 2994) > 0.001  # 2,995 is the least number that shows < .1 %
+    np.testing.assert_allclose(upper_bound(0, 100), 1 - 0.05**0.01, rtol=1e-9)
+
+
+def test_the_ends_of_the_range_are_exact():
+    assert clopper_pearson(0, 10)[0] == 0.0
+    assert clopper_pearson(10, 10)[1] == 1.0
+    assert upper_bound(10, 10) == 1.0
+    low, high = clopper_pearson(1, 1)
+    assert (round(low, 6), high) == (0.025, 1.0)
+
+
+@pytest.mark.parametrize("confidence", [0.8, 0.95, 0.99])
+@pytest.mark.parametrize("n", [7, 40])
+def test_the_interval_covers_every_rate_as_often_as_it_says(n, confidence):
+    bounds = np.asarray([clopper_pearson(k, n, confidence) for k in range(n + 1)])
+    one_sided = np.asarray([upper_bound(k, n, confidence) for k in range(n + 1)])
+    for rate in np.linspace(0.001, 0.999, 333):
+        chance = stats.binom.pmf(np.arange(n + 1), n, rate)
+        inside = (bounds[:, 0] <= rate) & (rate <= bounds[:, 1])
+        assert chance[inside].sum() >= confidence - 1e-9
+        assert chance[rate <= one_sided].sum() >= confidence - 1e-9
+
+
+def test_simulated_rates_are_covered():
+    events = np.random.default_rng(0).binomial(200, 0.03, 2000)
+    bounds = {k: clopper_pearson(int(k), 200) for k in np.unique(events)}
+    covered = np.mean([bounds[k][0] <= 0.03 <= bounds[k][1] for k in events])
+    assert 0.945 < covered < 0.995
+
+
+@pytest.mark.parametrize("interval", [clopper_pearson, upper_bound])
+@pytest.mark.parametrize(
+    ("k", "n", "confidence", "message"),
+    [
+        (-1, 10, 0.95, "^k is -1; it must be an integer, at least 0, at most 10"),
+        (11, 10, 0.95, "^k is 11; it must be an integer, at least 0, at most 10"),
+        (0.5, 10, 0.95, "^k is 0.5; it must be an integer"),
+        (0, 0, 0.95, "^n is 0; it must be an integer, at least 1"),
+        (1, 10, 0.0, "^confidence is 0.0; it must be a finite number, above 0"),
+        (1, 10, 1.0, "^confidence is 1.0; it must be below 1"),
+        (1, 10, 95, "^confidence is 95; it must be below 1"),
+        (1, 10, float("nan"), "^confidence is nan"),
+    ],
+)
+def test_impossible_counts_and_confidences_are_refused(interval, k, n, confidence, message):
+    with pytest.raises(ValueError, match=message):
+        interval(k, n, confidence)
+
+
+def test_the_interval_of_a_mean_is_students():
+    values = np.asarray([1.0, 2.0, 4.0, 8.0])
+    mean, width = mean_interval(values, 0.9)
+    low, high = stats.t.interval(0.9, 3, values.mean(), stats.sem(values))
+    np.testing.assert_allclose((mean - width, mean + width), (low, high), rtol=1e-12)
+
+
+@pytest.mark.parametrize("confidence", [0.8, 0.95])
+def test_the_interval_of_a_mean_covers_it_as_often_as_it_says(confidence):
+    samples = np.random.default_rng(1).normal(3.0, 2.0, (4000, 5))
+    intervals = [mean_interval(row, confidence) for row in samples]
+    covered = np.mean([abs(mean - 3.0) <= width for mean, width in intervals])
+    assert abs(covered - confidence) < 4 * np.sqrt(confidence * (1 - confidence) / 4000)
+
+
+def test_the_mean_of_one_value_has_no_width():
+    mean, width = mean_interval([2.5])
+    assert mean == 2.5
+    assert np.isnan(width)
+
+
+def test_equal_values_have_an_interval_of_width_zero():
+    assert mean_interval(np.full(5, 7.0)) == (7.0, 0.0)
+
+
+def test_the_mean_of_no_values_and_bad_confidences_are_refused():
+    with pytest.raises(ValueError, match="^number of values is 0; it must be .*at least 1"):
+        mean_interval([])
+    with pytest.raises(ValueError, match="^confidence is 1.5"):
+        mean_interval([1.0, 2.0], 1.5)
