@@ -6,18 +6,20 @@ import importlib.util
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import tyro
 
 from experiments import console, pipeline
+from experiments.recipes import RECIPES
+
+C = TypeVar("C")
 
 
 def main(
     name: str,
     about: str,
     presets: Mapping[str, Callable[[str], Any]],
-    recipes: Sequence[str],
     make_task: Callable[[Any], pipeline.Task],
     argv: Sequence[str] | None = None,
 ) -> Path:
@@ -27,21 +29,20 @@ def main(
         name: of the module, for --help.
         about: what it does, for --help.
         presets: by name, functions from a recipe's name to a configuration.
-        recipes: names of recipes, the default first.
         make_task: from a configuration to the task.
         argv: arguments, the process's own if not given.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", default="quick")
-    first.add_argument("--recipe", default=recipes[0])
+    first.add_argument("--recipe", default=RECIPES[0])
     chosen, rest = first.parse_known_args(argv)
     try:
         preset = presets[_among("preset", chosen.preset, presets)]
-        config = preset(_among("recipe", chosen.recipe, recipes))
+        config = preset(_among("recipe", chosen.recipe, RECIPES))
         text = (
             f"{about}\n\n--preset {{{','.join(presets)}}} (default quick) and --recipe "
-            f"{{{','.join(recipes)}}} (default {recipes[0]}) choose the values below; any of "
+            f"{{{','.join(RECIPES)}}} (default {RECIPES[0]}) choose the values below; any of "
             "them can be overridden."
         )
         config = tyro.cli(
@@ -67,7 +68,7 @@ def _among(field: str, value: str, allowed: Any) -> str:
     return value
 
 
-def override(config: Any, **changes: Any) -> Any:
+def override(config: C, **changes: Any) -> C:
     """A copy with some fields changed; nested ones are named a__b."""
     nested: dict[str, dict[str, Any]] = {}
     flat = {}
@@ -79,4 +80,4 @@ def override(config: Any, **changes: Any) -> Any:
             flat[name] = value
     for head, inner in nested.items():
         flat[head] = override(getattr(config, head), **inner)
-    return dataclasses.replace(config, **flat)
+    return dataclasses.replace(config, **flat)  # type: ignore[type-var]

@@ -10,6 +10,7 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -23,7 +24,8 @@ class Bar:
     """One stage's progress bar; call it with what is done and anything worth saying."""
 
     def __init__(self, progress: Progress, name: str):
-        self._progress, self._name, self._task, self._stage = progress, name, None, ""
+        self._progress, self._name, self._stage = progress, name, ""
+        self._task: TaskID | None = None
 
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
         """Shows that `done` of `total` of `stage` are done; a new stage gets a bar of its own."""
@@ -38,8 +40,8 @@ class Bar:
 def progress(name: str) -> Iterator[Bar]:
     """A bar with elapsed and remaining time."""
     columns = (
-        TextColumn("{task.description:28}"),
-        BarColumn(bar_width=24),
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=12),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TextColumn("ETA"),
@@ -63,7 +65,7 @@ def table(title: str, rows: Sequence[Mapping[str, Any]], columns: Sequence[str])
     """Prints rows under their column names."""
     grid = Table(title=title, title_justify="left")
     for column in columns:
-        grid.add_column(column.replace("_", " "), justify="left" if column == "env" else "right")
+        grid.add_column(column.replace("_", " "), justify="right")
     for row in rows:
         grid.add_row(*(show(row[column]) for column in columns))
     console.print(grid)

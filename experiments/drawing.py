@@ -10,8 +10,8 @@ import numpy as np
 from experiments.pipeline import MEDIA, Finished, key_of
 from rp_jax import evaluate
 from rp_jax.kinematics import Vehicle, make_vehicle
-from rp_jax.plot import curves, maps, scenes
 from rp_jax.planning import loop
+from rp_jax.plot import curves, maps, scenes
 from rp_jax.threat.report import predict
 
 

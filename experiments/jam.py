@@ -8,35 +8,10 @@ from dataclasses import dataclass, field
 import jax
 import numpy as np
 
-from experiments import cli, pipeline
+from experiments import cli, pipeline, recipes
 from rp_jax.envs import jam
-from rp_jax.planning.dqn import DQNConfig
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.threat.build import ThreatConfig
-from rp_jax.threat.fit import FitConfig
-
-WALL = ThreatConfig(
-    states=200_000,
-    fit=FitConfig(hidden=(64, 64, 32), steps=12_000, batch=2048, learning_rate=5e-3),
-)
-OBSTACLE = ThreatConfig(
-    states=200_000,
-    paths=64,
-    sampling="preferential",
-    prudence=0.01,
-    fit=FitConfig(hidden=(128, 128, 128), steps=12_000, batch=1024, learning_rate=3e-3),
-)
-# Appendix G.1: 100,000 states x 10,000 paths.
-PAPER_WALL = ThreatConfig(
-    states=100_000,
-    paths=10_000,
-    fit=FitConfig((100, 50), "relu", 3900, 512, 1e-2, 1e-2, cosine=False),
-)
-PAPER_OBSTACLE = ThreatConfig(
-    states=100_000,
-    paths=1_000,
-    fit=FitConfig((500, 500, 500), "relu", 4900, 512, 1e-3, 1e-2, cosine=False),
-)
 
 
 @dataclass(frozen=True)
@@ -45,8 +20,8 @@ class Config(pipeline.Config):
 
     obstacles: int = 8  # while learning
     test_obstacles: tuple[int, ...] = (3, 8, 15)  # while testing
-    wall: ThreatConfig = field(default_factory=lambda: WALL)  # threat of a wall point
-    obstacle: ThreatConfig = field(default_factory=lambda: OBSTACLE)  # threat of an obstacle
+    wall: ThreatConfig = field(default_factory=lambda: recipes.TUNED_WALL)  # threat of a wall point
+    obstacle: ThreatConfig = field(default_factory=lambda: recipes.TUNED_OBSTACLE)  # of an obstacle
 
 
 def quick(recipe: str) -> Config:
@@ -61,32 +36,13 @@ def full(recipe: str) -> Config:
 
 
 def paper(config: Config) -> Config:
-    """The paper's architectures and hyperparameters (appendix G.1, table in docs/fidelity.md)."""
+    """The paper's architectures and hyperparameters (appendix G.1)."""
     return cli.override(
-        config, wall=PAPER_WALL, obstacle=PAPER_OBSTACLE, planning=PAPER_PLANNING
+        config,
+        wall=recipes.PAPER_WALL,
+        obstacle=recipes.PAPER_OBSTACLE,
+        planning=recipes.PAPER_PLANNING,
     )
-
-
-PAPER_PLANNING = LoopConfig(
-    network="paper",
-    learner=DQNConfig(
-        gamma=0.9,
-        learning_rate=1e-3,
-        epsilon=1e-2,
-        anneal=False,
-        polyak=0.0,
-        period=1000,
-        reward_scale=1.0,
-    ),
-    steps=3_000_000,
-    num_envs=32,
-    batch=1024,  # 32 per step, as in the original
-    n_step=1,
-    replay=1_000_000,
-    replay_start=640,
-    prioritised=True,
-    explore_share=1.0,
-)
 
 
 def make_task(config: Config) -> pipeline.Task:
@@ -129,10 +85,9 @@ def draw(run: pipeline.Finished) -> None:
         bar("", 2, 4, "threat maps")
         draw_maps(run)
     bar("", 3, 4, "animation")
-    longest = max(shown, key=lambda e: len(e.action))
-    scenes.animate(
-        scene, longest, jam.ACCELERATIONS, jam.TURNS, x, folder.parent / "animation.gif"
-    )
+    ended = [e for e in shown if len(e.action) < limit] or shown
+    longest = max(ended, key=lambda e: len(e.action))
+    scenes.animate(scene, longest, jam.ACCELERATIONS, jam.TURNS, x, folder.parent / "animation.gif")
     bar("", 4, 4, "")
 
 
@@ -164,7 +119,10 @@ def draw_maps(run: pipeline.Finished) -> None:
     maps.heat_maps(walls, run.config.x, run.folder / "threat_of_one_wall_point.png")
     key = pipeline.key_of(run.config.seed, pipeline.MEDIA)
     state = jam.reset(key, run.pmdp.params)
-    velocities = {"heading 45 deg, speed 0.1": (np.pi / 4, 0.1), "heading 180 deg, speed 0.05": (np.pi, 0.05)}
+    velocities = {
+        "heading 45 deg, speed 0.1": (np.pi / 4, 0.1),
+        "heading 180 deg, speed 0.05": (np.pi, 0.05),
+    }
     sums = drawing.threat_of_all(run, state, (0.0, 3.0, 0.0, 3.0), velocities)
     others = jax.tree.map(np.asarray, state.obstacles)
 
@@ -179,7 +137,6 @@ def draw_maps(run: pipeline.Finished) -> None:
 
 
 PRESETS = {"quick": quick, "full": full}
-RECIPES = ("tuned", "paper")
 
 if __name__ == "__main__":
-    cli.main("experiments.jam", __doc__ or "", PRESETS, RECIPES, make_task)
+    cli.main("experiments.jam", __doc__ or "", PRESETS, make_task)

@@ -31,11 +31,24 @@ from rp_jax.validate import number, one_of
 
 THREAT, PLANNING, EVALUATION, MEDIA = range(4)  # streams of random numbers, all apart
 CHUNKS = 30  # of a training run: points of its curves
-TABLE = (
-    "env variant method seed episodes return_mean return_ci95 uncrashed_return_mean crashes "
-    "crash_rate crash_upper95 goal_rate interventions insecure seconds_per_100_actions "
-    "train_seconds"
-).split()
+TABLE = [
+    "env",
+    "variant",
+    "method",
+    "seed",
+    "episodes",
+    "return_mean",
+    "return_ci95",
+    "uncrashed_return_mean",
+    "crashes",
+    "crash_rate",
+    "crash_upper95",
+    "goal_rate",
+    "interventions",
+    "insecure",
+    "seconds_per_100_actions",
+    "train_seconds",
+]
 
 
 @dataclass(frozen=True)
@@ -90,7 +103,7 @@ class Finished(NamedTuple):
     """A run, for drawing."""
 
     task: Task
-    config: Config
+    config: Any  # the task's own Config
     pmdp: PMDP
     trained: Trained
     rows: list[dict[str, Any]]
@@ -142,8 +155,18 @@ def learn_threats(task: Task, config: Config, folder: Path) -> tuple[dict, dict,
     artefact.save(folder / "threat", task.name, models, subs, about)
     rows = [{"hazard": kind, "of": "one", **found} for kind, found in reports.items()]
     rows += [{"hazard": kind, "of": "sum", **found} for kind, found in sums.items()]
-    columns = ("hazard of mae rmse bias spearman unsafe_called_safe safe_called_unsafe").split()
-    console.table(f"threat models against fresh labels (x = {config.x:g})", rows, columns)
+    shown = [
+        {
+            "hazard": row["hazard"],
+            "of": row["of"],
+            **{name: row[name] for name in ("mae", "rmse", "bias", "spearman")},
+            "unsafe called safe": f"{100 * row['unsafe_called_safe']:.2f} %",
+            "safe called unsafe": f"{100 * row['safe_called_unsafe']:.2f} %",
+        }
+        for row in rows
+    ]
+    title = f"threat models against fresh labels (x = {config.x:g})"
+    console.table(title, shown, list(shown[0]))
     storage.write_json(folder / "threat" / "report.json", rows)
     storage.write_json(folder / "threat" / "curves.json", curves)
     return models, curves, timings
@@ -207,13 +230,13 @@ def plan(task: Task, config: Config, models: Mapping, folder: Path) -> Trained:
     with console.progress("planning") as bar:
         bar("", 0, chunks, "compiling")
         began = time.perf_counter()
-        start = jax.jit(jax.vmap(loop.init, (0, None, None)), static_argnums=2)
-        start = start.lower(keys, pmdp, planning).compile()
-        step = jax.jit(
+        init = jax.jit(jax.vmap(loop.init, (0, None, None)), static_argnums=2)
+        start = init.lower(keys, pmdp, planning).compile()
+        chunk = jax.jit(
             jax.vmap(loop.chunk, (0, None, None, None)), static_argnums=(2, 3), donate_argnums=0
         )
-        shapes = jax.tree.map(lambda s: jax.ShapeDtypeStruct(s.shape, s.dtype), start.out_info[0])
-        step = step.lower(shapes, pmdp, planning, length).compile()
+        shapes, _ = jax.eval_shape(init, keys, pmdp, planning)
+        step = chunk.lower(shapes, pmdp, planning, length).compile()
         compiled = time.perf_counter()
         state, metrics = start(keys, pmdp)
         for i in range(chunks):
@@ -360,12 +383,29 @@ def write_tables(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     writer.writeheader()
     writer.writerows(rows)
     storage.write_bytes(folder / "table.csv", text.getvalue().encode())
-    columns = [c for c in TABLE if c not in ("env", "method")]
-    console.table(f"{rows[0]['env']}: {rows[0]['method']}", rows, columns)
+    shown = [readable(row) for row in rows]
+    console.table(f"{rows[0]['env']}: {rows[0]['method']}", shown, list(shown[0]))
     if len({row["seed"] for row in rows}) > 1:
         summary = over_seeds(rows)
         storage.write_json(folder / "summary.json", summary)
-        console.table("over seeds", summary, list(summary[0]))
+        shown = [readable({**row, "seed": "all"}) for row in summary]
+        console.table("over seeds", shown, list(shown[0]))
+
+
+def readable(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of the table, in few enough columns for a terminal."""
+    low, high = 100 * row["crash_lower95"], 100 * row["crash_upper95"]
+    cells = {
+        "case": row["variant"],
+        "seed": row["seed"],
+        "return": f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}",
+        "crashes": f"{row['crashes']:,} of {row['episodes']:,}",
+        "% [95 %]": f"{100 * row['crash_rate']:.2f} [{low:.2f}, {high:.2f}]",
+    }
+    if "goal_rate" in row:
+        cells["goal"] = f"{row['goal_rate']:.3f}"
+        cells["s/100"] = f"{row['seconds_per_100_actions']:.2f}"
+    return cells
 
 
 def run(make_task: Callable[[Any], Task], config: Config, preset: str) -> Path:

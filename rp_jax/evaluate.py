@@ -14,7 +14,6 @@ from rp_jax.envs.base import select
 from rp_jax.planning.pmdp import PMDP, Percept
 
 
-
 class Episodes(NamedTuple):
     """One row per episode."""
 
@@ -29,7 +28,7 @@ class Episodes(NamedTuple):
 
 def greedy(network: nn.Module, weights: Any) -> Callable[[Percept], Array]:
     """Action values of a learned Q-network, (B, A)."""
-    return lambda percept: network.apply(weights, percept.encoded)
+    return lambda percept: jnp.asarray(network.apply(weights, percept.encoded))
 
 
 def run_episodes(
@@ -62,7 +61,7 @@ def run_episodes(
         states = jax.vmap(reset, (0, None))(keys, pmdp.params)
         zeros = jnp.zeros(batch, pmdp.x.dtype)
         none = jnp.zeros(batch, bool)
-        causes = {kind: none for kind in pmdp.env.sub_rmdps(pmdp.params)}
+        causes = dict.fromkeys(pmdp.env.sub_rmdps(pmdp.params), none)
         count = jnp.zeros(batch, jnp.int32)
         rows = Episodes(zeros, zeros, none, count, count, count, causes)
 
@@ -105,7 +104,7 @@ def summarise(rows: Episodes, penalty: float) -> dict[str, Any]:
     rows = jax.tree.map(np.asarray, rows)
     n, k = rows.score.size, int((rows.danger > 0).sum())
     returns = rows.score - penalty * rows.danger
-    mean, width = statistics.mean_interval(returns)
+    mean, width = statistics.mean_interval(np.asarray(returns))
     steps = int(rows.length.sum())
     safe = rows.danger == 0
     low, high = statistics.clopper_pearson(k, n)
@@ -163,9 +162,7 @@ def record(
         move = jax.vmap(pmdp.env.step, (0, 0, 0, None))
         reached, outcome = move(keys, states, action, pmdp.params)
         kept = jax.vmap(select)(alive, reached, states)
-        shown = Recording(
-            states, action, percept.threat, percept.admissible, percept.secure, alive
-        )
+        shown = Recording(states, action, percept.threat, percept.admissible, percept.secure, alive)
         return (kept, alive & ~outcome.done), shown
 
     begin = (starts, jnp.ones(count, bool))
@@ -182,9 +179,7 @@ def visited_states(key: Array, pmdp: PMDP, count: int, steps: int = 30) -> Any:
         states, alive, t = carry
         percept = pmdp.perceive(states)
         pick, move = jax.random.split(key)
-        action = jax.vmap(shield.masked_sample)(
-            jax.random.split(pick, count), percept.admissible
-        )
+        action = jax.vmap(shield.masked_sample)(jax.random.split(pick, count), percept.admissible)
         keys = jax.random.split(move, count)
         move_all = jax.vmap(pmdp.env.step, (0, 0, 0, None))
         reached, outcome = move_all(keys, states, action, pmdp.params)

@@ -78,7 +78,7 @@ class SubRMDP(struct.PyTreeNode):
 
     agent: AgentModel
     source: Any  # a HazardSource
-    beta: float = 0.999  # discount of danger
+    beta: Array | float = 0.999  # discount of danger
 
 
 def reach(agent: AgentModel, horizon: int) -> tuple[np.ndarray, np.ndarray]:

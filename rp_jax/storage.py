@@ -84,7 +84,9 @@ def new_folder(path: Path) -> Path:
 def leaves(tree: Any) -> dict[str, np.ndarray]:
     """A pytree's arrays by their paths."""
     flat, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): np.asarray(a) for path, a in flat}
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="/"): np.asarray(a) for path, a in flat
+    }
 
 
 def save(folder: Path, kind: str, tree: Any, about: Mapping[str, Any]) -> None:
@@ -127,7 +129,9 @@ def read_manifest(folder: Path, kind: str) -> dict[str, Any]:
     try:
         manifest = json.loads(path.read_text())
     except FileNotFoundError:
-        raise StorageError(f"{folder}: there is no manifest.json; it is not a saved {kind}") from None
+        raise StorageError(
+            f"{folder}: there is no manifest.json; it is not a saved {kind}"
+        ) from None
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise StorageError(f"{path}: cannot be read ({error})") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:

@@ -1,0 +1,1 @@
+"""Environments: who moves how, what is dangerous, what is seen."""

@@ -25,7 +25,7 @@ ACCELERATIONS = (-0.02, 0.0, 0.02)  # room units / step^2
 TURNS = (-0.15, -0.05, 0.0, 0.05, 0.15)  # radians / step
 SPEEDS = tuple(round(0.02 * k, 2) for k in range(-2, 6))  # -.04 .. .1 room units / step
 LIDAR_BINS = 360
-SCALE = (1.0, 1.0, 1.0, 10.0)  # of x, y, bend, speed, for learners
+SCALE: tuple[float, ...] = (1.0, 1.0, 1.0, 10.0)  # of x, y, bend, speed, for learners
 FIDELITIES = ("released", "paper")
 
 
@@ -123,9 +123,7 @@ def reset(key: Array, params: Params) -> State:
     return start_at(Vehicle(position=position, heading=heading, speed=jnp.zeros(())), params)
 
 
-def step(
-    key: Array, state: State, action: Array, params: Params
-) -> tuple[State, base.Outcome]:
+def step(key: Array, state: State, action: Array, params: Params) -> tuple[State, base.Outcome]:
     """One transition; `key` is not used, since nothing here is random.
 
     The reward is the number of centre points passed, less 1 when (almost) standing still.

@@ -33,7 +33,9 @@ CLEARANCE = 1.0  # obstacles appear at least this far from the agent
 ZONE = 0.5  # side (released) or radius (paper) of the corner safety zones
 LIDAR_BINS = 360
 SEEN_OBSTACLES = 8
-SCALE = (1.0, 1.0, 1.0, 10.0) * (SEEN_OBSTACLES + 1)  # of x, y, heading, speed, for learners
+SCALE: tuple[float, ...] = (1.0, 1.0, 1.0, 10.0) * (
+    SEEN_OBSTACLES + 1
+)  # of x, y, heading, speed, for learners
 UNSEEN = (-1.5, -1.51)  # where the observation puts obstacles that do not exist
 FIDELITIES = ("released", "paper")
 MOST_OBSTACLES = 400  # of radius .1: more leave no free place in the room
@@ -279,9 +281,7 @@ def transition(
     )
 
 
-def step(
-    key: Array, state: State, action: Array, params: Params
-) -> tuple[State, base.Outcome]:
+def step(key: Array, state: State, action: Array, params: Params) -> tuple[State, base.Outcome]:
     """One transition: agent and obstacles move, stray obstacles are relocated, crashes found."""
     return transition(state, action, draw(key, state, action, params), params)
 

@@ -175,7 +175,7 @@ def interact(
     """Every environment takes one step; the window moves on; nothing is learned."""
     choose_key, step_key, reset_key = jax.random.split(key, 3)
     batch = config.num_envs
-    values = network.apply(state.learner.params, state.encoded)
+    values = jnp.asarray(network.apply(state.learner.params, state.encoded))
     epsilon = exploration(state.iteration, config)
     keys = jax.random.split(choose_key, batch)
     action = jax.vmap(_choose, (0, 0, 0, None))(keys, values, state.bits, epsilon)
@@ -244,7 +244,7 @@ def init(key: Array, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics
     false = jnp.zeros(batch, bool)
     taken = Taken(encoded, jnp.zeros(batch, jnp.int32), zeros, false, false, encoded, bits)
     window = jax.tree.map(lambda a: jnp.stack([a] * config.n_step), taken)
-    example = jax.vmap(n_step_transition, (1, None))(window, config.learner.gamma)
+    example = _oldest(window, config)
     state = LoopState(
         states=states,
         encoded=encoded,
@@ -257,15 +257,27 @@ def init(key: Array, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics
         key=key,
         iteration=jnp.asarray(0, jnp.int32),
     )
-    # The window is filled by real steps, then the replay, before anything is learned.
-    window_keys = jax.random.split(warm_key, config.n_step)
-    metrics = []
-    for warm in window_keys:
-        state, new = interact(warm, state, pmdp, network, config)
-        metrics.append(new)
+
+    def warm(state: LoopState, key: Array):
+        state, metrics = interact(key, state, pmdp, network, config)
+        return state, (metrics, _oldest(state.window, config))
+
+    # Real steps fill the window and then the replay, before anything is learned.
     fill = -(-config.replay_start // batch)
-    state, new = jax.lax.scan(lambda s, _: collect(s, pmdp, config), state, None, length=fill)
-    return state, jax.tree.map(lambda first, *a: jnp.sum(first) + sum(a), new, *metrics)
+    warm_keys = jax.random.split(warm_key, config.n_step - 1 + fill)
+    state, (metrics, items) = jax.lax.scan(warm, state, warm_keys)
+    items = jax.tree.map(
+        lambda a: a[config.n_step - 1 :].reshape(fill * batch, *a.shape[2:]), items
+    )
+    state = state._replace(
+        replay=replay.add(state.replay, items), iteration=jnp.asarray(fill, jnp.int32)
+    )
+    return state, jax.tree.map(lambda m: jnp.sum(m, axis=0), metrics)
+
+
+def _oldest(window: Taken, config: LoopConfig) -> Transition:
+    """(B,) transitions from the oldest steps of the windows."""
+    return jax.vmap(n_step_transition, (1, None))(window, config.learner.gamma)
 
 
 def collect(state: LoopState, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics]:
@@ -273,16 +285,12 @@ def collect(state: LoopState, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState
     network, replay = make_network(config, pmdp), make_replay(config)
     key, act_key = jax.random.split(state.key)
     state, metrics = interact(act_key, state, pmdp, network, config)
-    new = jax.vmap(n_step_transition, (1, None))(state.window, config.learner.gamma)
-    state = state._replace(
-        replay=replay.add(state.replay, new), key=key, iteration=state.iteration + 1
-    )
+    stored = replay.add(state.replay, _oldest(state.window, config))
+    state = state._replace(replay=stored, key=key, iteration=state.iteration + 1)
     return state, metrics
 
 
-def learn(
-    key: Array, state: LoopState, pmdp: PMDP, config: LoopConfig
-) -> tuple[LoopState, Array]:
+def learn(key: Array, state: LoopState, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Array]:
     """Sample and update once; returns the loss."""
     network, replay = make_network(config, pmdp), make_replay(config)
     sample = replay.sample(state.replay, key)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import matplotlib
 import numpy as np
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 
 matplotlib.use("Agg")
@@ -36,20 +37,19 @@ def heat_maps(panels: Sequence[Panel], x: float, path: Path, decorate=None) -> N
     figure, axes = plt.subplots(
         lines, columns, figsize=(4.6 * columns, 3.9 * lines), layout="constrained", squeeze=False
     )
-    image = None
     for i, axis in enumerate(axes.flat):
         if i >= len(panels):
             axis.axis("off")
             continue
         panel = panels[i]
-        image = axis.imshow(
+        axis.imshow(
             np.maximum(panel.threat, FLOOR),
             origin="lower",
             extent=panel.extent,
             norm=LogNorm(FLOOR, 1.0, clip=True),
             cmap="inferno",
         )
-        if 0 < x and panel.threat.min() < x < panel.threat.max():
+        if x > 0 and panel.threat.min() < x < panel.threat.max():
             axis.contour(
                 panel.threat, [x], extent=panel.extent, origin="lower", colors="cyan", linewidths=1
             )
@@ -57,6 +57,7 @@ def heat_maps(panels: Sequence[Panel], x: float, path: Path, decorate=None) -> N
         axis.set_aspect("equal")
         if decorate is not None:
             decorate(axis, i)
-    figure.colorbar(image, ax=axes, label=f"threat (cyan: x = {x:g})", shrink=0.8)
+    scale = ScalarMappable(LogNorm(FLOOR, 1.0, clip=True), "inferno")
+    figure.colorbar(scale, ax=axes, label=f"threat (cyan: x = {x:g})", shrink=0.8)
     figure.savefig(path, dpi=120)
     plt.close(figure)

@@ -48,9 +48,7 @@ def draw_scene(axis: Any, scene: Scene) -> None:
     axis.set_yticks([])
 
 
-def trajectories(
-    panels: Sequence[tuple[str, Scene, Sequence[Episode]]], path: Path
-) -> None:
+def trajectories(panels: Sequence[tuple[str, Scene, Sequence[Episode]]], path: Path) -> None:
     """Paths of several episodes per panel (figure 6); S marks the start, red crosses crashes."""
     figure, axes = plt.subplots(
         1, len(panels), figsize=(5 * len(panels), 4.6), layout="constrained", squeeze=False
@@ -103,7 +101,9 @@ def animate(
         for _ in range(episode.obstacles.shape[1])
     ]
     agent = world.add_patch(Circle((0, 0), scene.radius, color=AGENT, zorder=4))
-    noses = [world.plot([], [], color="black", linewidth=1, zorder=5)[0] for _ in range(1 + len(others))]
+    noses = [
+        world.plot([], [], color="black", linewidth=1, zorder=5)[0] for _ in range(1 + len(others))
+    ]
     # The leftmost turn stands leftmost, as seen by the driver.
     image = table.imshow(np.ones(shape), norm=LogNorm(1e-4, 1, clip=True), cmap="inferno")
     table.set_xticks(range(shape[1]), [f"{t:+.2f}" for t in turns[::-1]])
@@ -135,8 +135,8 @@ def animate(
                 crosses[i][j].set_text("" if allowed[i, j] else "x")
         row, column = divmod(int(episode.action[t]), shape[1])
         frame.set_xy((shape[1] - 1 - column - 0.5, row - 0.5))
-        state = "" if episode.secure[t] else ", none admissible: least threat"
-        table.set_title(f"x: threat above {x:g}{state}", fontsize=10)
+        state = "" if episode.secure[t] else \n(none below: the least threatening is taken)"
+        table.set_title(f"crossed out: threat above {x:g}{state}", fontsize=10)
         world.set_title(f"step {t}" + (", CRASH" if episode.crashed and t == frames - 1 else ""))
         if on_progress:
             on_progress(t + 1, frames)

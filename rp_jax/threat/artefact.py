@@ -76,10 +76,11 @@ def load(folder: Path, environment: str, subs: Mapping[str, SubRMDP]) -> dict[st
 def _blank(folder: Path, kind: str, facts: Any, sub: SubRMDP) -> ThreatModel:
     """A model of the right structure, whose arrays are to be replaced."""
     hidden = facts.get("hidden") if isinstance(facts, dict) else None
-    good = isinstance(hidden, list) and all(
-        isinstance(width, int) and 0 < width <= WIDEST for width in hidden
-    )
-    if not good or len(hidden) > 16:
+    if (
+        not isinstance(hidden, list)
+        or len(hidden) > 16
+        or not all(isinstance(width, int) and 0 < width <= WIDEST for width in hidden)
+    ):
         raise storage.StorageError(
             f"{folder}: {kind}: hidden is {hidden!r}; it must list up to 16 widths of at most "
             f"{WIDEST}"
@@ -96,5 +97,5 @@ def _blank(folder: Path, kind: str, facts: Any, sub: SubRMDP) -> ThreatModel:
     )
     shapes = jax.eval_shape(network.init, jax.random.key(0), features)
     params = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), shapes)
-    scale = np.zeros(features.shape, features.dtype)
+    scale = jnp.zeros(features.shape, features.dtype)
     return ThreatModel(sub.source, params, scale, jnp.zeros(()), network)

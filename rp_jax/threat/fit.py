@@ -1,7 +1,7 @@
 """Supervised learning of a threat function from labelled states (paper, appendix G.1)."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,7 +51,7 @@ class FitConfig:
 class FitState(NamedTuple):
     """Carried through the fit."""
 
-    params: dict
+    params: Any
     opt_state: optax.OptState
     key: Array
 
@@ -68,7 +68,7 @@ def mirror(data: Dataset, sub: SubRMDP) -> Dataset:
 def split(key: Array, data: Dataset, share: float) -> tuple[Dataset, Dataset]:
     """(training, validation) rows, drawn at random."""
     n = len(data.features)
-    held = int(round(n * share))
+    held = round(n * share)
     order = jax.random.permutation(key, n)
     part = lambda rows: jax.tree.map(lambda a: a[rows], data)  # noqa: E731
     return part(order[held:]), part(order[:held])
@@ -86,13 +86,17 @@ def optimiser(config: FitConfig) -> optax.GradientTransformation:
     return optax.adam(schedule, eps=config.epsilon)
 
 
-def init(key: Array, sub: SubRMDP, data: Dataset, config: FitConfig) -> tuple[ThreatModel, FitState]:
+def init(
+    key: Array, sub: SubRMDP, data: Dataset, config: FitConfig
+) -> tuple[ThreatModel, FitState]:
     """A fresh model whose inputs are scaled by the spread of the data, and its fit's state."""
     network = ThreatNetwork(config.hidden, data.threat.shape[-1], config.activation)
     begin, onward = jax.random.split(key)
     params = network.init(begin, data.features[:1])
     scale = 1.0 / (jnp.std(data.features, axis=0) + 1e-6)
-    model = ThreatModel(source=sub.source, params=params, scale=scale, shift=jnp.zeros(()), network=network)
+    model = ThreatModel(
+        source=sub.source, params=params, scale=scale, shift=jnp.zeros(()), network=network
+    )
     return model, FitState(params, optimiser(config).init(params), onward)
 
 

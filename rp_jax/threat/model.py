@@ -40,7 +40,7 @@ class ThreatModel(struct.PyTreeNode):
     def logits(self, features: Array) -> Array:
         """(..., F) -> (..., A)."""
         scale = jnp.broadcast_to(self.scale, features.shape)
-        return self.network.apply(self.params, features * scale) + self.shift
+        return jnp.asarray(self.network.apply(self.params, features * scale)) + self.shift
 
     def __call__(self, features: Array) -> Array:
         """(..., F) -> (..., A) threats in [0, 1]."""

@@ -36,9 +36,10 @@ def total_threat(
             f"models: no threat model for {', '.join(missing)}; there are models for "
             f"{', '.join(sorted(models))}"
         )
-    total = sum(_summed(models[kind], agents, hazards[kind]) for kind in sorted(hazards))
+    parts = [_summed(models[kind], agents, hazards[kind]) for kind in sorted(hazards)]
+    total = jnp.sum(jnp.stack(parts), axis=0)
     terms = sum(group.present.shape[1] for group in hazards.values())
-    return total * (1 + (terms + 1) * jnp.finfo(total.dtype).eps)
+    return total * (1 + (terms + 1) * float(jnp.finfo(total.dtype).eps))
 
 
 def _summed(model: ThreatModel, agents: Any, hazards: Hazards) -> Array:

@@ -1,0 +1,1 @@
+"""Throughput of each stage: `python -m benchmarks`, or one of its modules alone."""

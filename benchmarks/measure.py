@@ -1,0 +1,108 @@
+"""How a benchmark is taken: compile time apart, the median of repeats with their spread."""
+
+import argparse
+import os
+import platform
+import resource
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import rp_jax
+from experiments import console
+from rp_jax import storage
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measured program."""
+
+    name: str
+    unit: str  # what `per_second` counts
+    batch: int
+    per_second: float  # median
+    slowest: float
+    fastest: float
+    compile_seconds: float
+    peak_mib: float  # of the process so far
+
+
+def measure(
+    name: str,
+    unit: str,
+    batch: int,
+    count: float,
+    function: Callable[..., Any],
+    *arguments: Any,
+    repeats: int = 5,
+) -> Row:
+    """Compiles `function`, runs it once to warm up, then `repeats` times.
+
+    Args:
+        name: of the row.
+        unit: what is counted.
+        batch: rows side by side.
+        count: units that one call gets done.
+        function: to be jitted; its result is waited for.
+        *arguments: of the call.
+        repeats: timed calls.
+    """
+    began = time.perf_counter()
+    compiled = jax.jit(function).lower(*arguments).compile()
+    compile_seconds = time.perf_counter() - began
+    jax.block_until_ready(compiled(*arguments))
+    rates = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        jax.block_until_ready(compiled(*arguments))
+        rates.append(count / (time.perf_counter() - began))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return Row(
+        name, unit, batch, statistics.median(rates), min(rates), max(rates), compile_seconds, peak
+    )
+
+
+def machine() -> dict[str, Any]:
+    """What was measured on, and with what."""
+    return {
+        "device": jax.devices()[0].device_kind,
+        "platform": jax.default_backend(),
+        "processor": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "rp_jax": rp_jax.__version__,
+    }
+
+
+def report(name: str, rows: Sequence[Row], out: Path | None) -> None:
+    """Prints the rows, and writes them as JSON if `out` is given."""
+    shown = [
+        {
+            "what": row.name,
+            "batch": row.batch,
+            "per second": (f"{row.per_second:,.0f}"),
+            "unit": row.unit,
+            "slowest .. fastest": f"{row.slowest:,.0f} .. {row.fastest:,.0f}",
+            "compile s": f"{row.compile_seconds:.2f}",
+            "peak MiB": f"{row.peak_mib:,.0f}",
+        }
+        for row in rows
+    ]
+    console.table(name, shown, list(shown[0]))
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        rows_json = [asdict(row) for row in rows]
+        storage.write_json(out / f"{name}.json", {"machine": machine(), "rows": rows_json})
+
+
+def main(name: str, run: Callable[[], list[Row]]) -> None:
+    """The command line of one benchmark."""
+    parser = argparse.ArgumentParser(prog=f"python -m benchmarks.{name}")
+    parser.add_argument("--out", type=Path, help="folder for the JSON")
+    report(name, run(), parser.parse_args().out)

@@ -1,0 +1,37 @@
+"""P-MDPs with untrained threat models of the tuned sizes: speed does not depend on the weights."""
+
+import jax
+import jax.numpy as jnp
+
+from experiments import circuit as circuit_experiment
+from experiments import jam as jam_experiment
+from experiments import pipeline
+from rp_jax.planning.pmdp import PMDP
+from rp_jax.recon import sampling
+from rp_jax.threat import fit
+
+
+def tasks() -> dict[str, tuple[pipeline.Task, pipeline.Config]]:
+    """The two tasks with their quick settings."""
+    found = {}
+    for module in (circuit_experiment, jam_experiment):
+        config = module.quick("tuned")
+        task = module.make_task(config)
+        found[task.name] = (task, config)
+    return found
+
+
+def pmdp_of(task: pipeline.Task, config: pipeline.Config) -> PMDP:
+    """The task's P-MDP. The models are fitted for 200 steps on uniform noise around zero threat,
+    so that actions are admissible at a plausible rate; their size is that of the tuned recipe."""
+    models = {}
+    for kind, sub in task.env.sub_rmdps(task.train).items():
+        features = sampling.uniform(jax.random.key(1), sub, 1000)
+        inside = jnp.linalg.norm(features[:, :2], axis=-1) < 0.25
+        threat = jnp.repeat(inside[:, None].astype(jnp.float32), 15, axis=1)
+        data = fit.Dataset(features, threat)
+        settings = task.threats[kind].fit
+        model, state = fit.init(jax.random.key(2), sub, data, settings)
+        state, _ = fit.run(model, state, data, settings, 200)
+        models[kind] = model.replace(params=state.params)
+    return pipeline.make_pmdp(task, config, models, task.train)

@@ -1,0 +1,122 @@
+"""Circuit (figure 6, table 2): trained on one track, tested on it, narrowed, and on a circle.
+
+python -m experiments.circuit --preset quick
+"""
+
+from dataclasses import dataclass, field
+
+import jax
+import numpy as np
+
+from experiments import cli, pipeline, recipes
+from rp_jax.envs import circuit
+from rp_jax.planning.loop import LoopConfig
+from rp_jax.threat.build import ThreatConfig
+
+
+@dataclass(frozen=True)
+class Config(pipeline.Config):
+    """Settings of Circuit."""
+
+    track: str = "default"  # while learning: default, narrowed or circle
+    test_tracks: tuple[str, ...] = ("default", "narrowed", "circle")  # while testing
+    wall: ThreatConfig = field(default_factory=lambda: recipes.TUNED_WALL)  # of a wall point
+
+
+def quick(recipe: str) -> Config:
+    """Minutes on two cores."""
+    config = Config(x=0.001, penalty=200.0, planning=LoopConfig(steps=1_800_000), episodes=10_000)
+    return paper(config) if recipe == "paper" else config
+
+
+def full(recipe: str) -> Config:
+    """What committed results are made with."""
+    return cli.override(quick(recipe), seeds=10 if recipe == "tuned" else 1, episodes=20_000)
+
+
+def paper(config: Config) -> Config:
+    """The paper's architectures and hyperparameters (appendix G.1)."""
+    return cli.override(config, wall=recipes.PAPER_WALL, planning=recipes.PAPER_PLANNING)
+
+
+def make_task(config: Config) -> pipeline.Task:
+    """Environments and threats, checked."""
+    if not config.test_tracks:
+        raise ValueError("test_tracks is (); it must name at least one track")
+    params = lambda track: circuit.make_params(track, fidelity=config.fidelity)  # noqa: E731
+    return pipeline.Task(
+        name="circuit",
+        env=circuit,
+        train=params(config.track),
+        tests={track: params(track) for track in config.test_tracks},
+        threats={"wall": config.wall},
+        draw=draw,
+    )
+
+
+def draw(run: pipeline.Finished) -> None:
+    """All figures of a run, and an animation."""
+    from experiments import drawing
+    from rp_jax.plot import scenes
+
+    bar, folder = run.bar, run.folder
+    bar("", 0, 4, "curves")
+    drawing.curves_of(run)
+    bar("", 1, 4, "trajectories")
+    panels = []
+    for variant, params in run.task.tests.items():
+        demo = circuit.demo_start(params)
+        keys = jax.random.split(pipeline.key_of(run.config.seed, pipeline.MEDIA), 7)
+        starts = jax.vmap(circuit.reset, (0, None))(keys, params)
+        starts = jax.tree.map(lambda a, b: jax.numpy.concatenate([a[None], b]), demo, starts)
+        episodes = drawing.play(run, params, starts, int(params.time_limit), None)
+        panels.append((variant, scenes.Scene(np.asarray(params.track.walls)), episodes))
+    scenes.trajectories(panels, folder / "trajectories.png")
+    if run.pmdp.threats:
+        bar("", 2, 4, "threat maps")
+        draw_maps(run)
+    bar("", 3, 4, "animation")
+    _, scene, episodes = panels[0]
+    scenes.animate(
+        scene,
+        episodes[0],
+        circuit.ACCELERATIONS,
+        circuit.TURNS,
+        run.config.x,
+        folder.parent / "animation.gif",
+    )
+    bar("", 4, 4, "")
+
+
+def draw_maps(run: pipeline.Finished) -> None:
+    """The threat of one wall point at three speeds, and of the whole track for two velocities."""
+    from experiments import drawing
+    from rp_jax.plot import maps
+
+    speeds = [0.1, 0.04, -0.04]
+    panels = drawing.threat_of_one(
+        run,
+        "wall",
+        [f"wall point, agent at {v:g}" for v in speeds],
+        lambda p, i: np.concatenate([p, np.full((len(p), 1), speeds[i])], axis=-1),
+    )
+    maps.heat_maps(panels, run.config.x, run.folder / "threat_of_one_wall_point.png")
+    walls = np.asarray(run.pmdp.params.track.walls)
+    (left, bottom), (right, top) = walls.min(axis=0) - 0.1, walls.max(axis=0) + 0.1
+    velocities = {
+        "heading 0 deg, speed 0.1": (0.0, 0.1),
+        "heading 90 deg, speed 0.1": (np.pi / 2, 0.1),
+    }
+    state = circuit.demo_start(run.pmdp.params)
+    sums = drawing.threat_of_all(run, state, (left, right, bottom, top), velocities)
+
+    def decorate(axis, i: int) -> None:
+        axis.plot(*walls.T, ",", color="white")
+
+    maps.heat_maps(sums, run.config.x, run.folder / "threat_of_all.png", decorate)
+
+
+PRESETS = {"quick": quick, "full": full}
+
+if __name__ == "__main__":
+    cli.main("experiments.circuit", __doc__ or "", PRESETS, make_task)

@@ -1,0 +1,51 @@
+"""Settings of the learner and the threat models that several tasks share."""
+
+from rp_jax.planning.dqn import DQNConfig
+from rp_jax.planning.loop import LoopConfig
+from rp_jax.threat.build import ThreatConfig
+from rp_jax.threat.fit import FitConfig
+
+TUNED_WALL = ThreatConfig(
+    states=150_000,
+    fit=FitConfig(hidden=(64, 64, 32), steps=12_000, batch=2048, learning_rate=5e-3),
+)
+TUNED_OBSTACLE = ThreatConfig(
+    states=200_000,
+    paths=64,
+    sampling="preferential",
+    prudence=0.002,
+    fit=FitConfig(hidden=(128, 128, 128), steps=12_000, batch=1024, learning_rate=3e-3),
+)
+
+# Appendix G.1: 100,000 states, 20 and 25 epochs of batches of 512. The labels of static hazards
+# are exact, and stand for the paper's 10,000 paths a state; those of moving ones come from fewer.
+PAPER_WALL = ThreatConfig(
+    states=100_000,
+    fit=FitConfig((100, 50), "relu", 3_900, 512, 1e-2, 1e-2, cosine=False),
+)
+PAPER_OBSTACLE = ThreatConfig(
+    states=100_000,
+    paths=1_000,
+    fit=FitConfig((500, 500, 500), "relu", 4_900, 512, 1e-3, 1e-2, cosine=False),
+)
+PAPER_PLANNING = LoopConfig(
+    network="paper",
+    learner=DQNConfig(
+        gamma=0.9,
+        learning_rate=1e-3,
+        epsilon=1e-2,
+        anneal=False,
+        polyak=0.0,
+        period=1_000,
+        reward_scale=1.0,
+    ),
+    steps=3_000_000,
+    num_envs=32,
+    batch=1024,  # 32 per step, as in the original
+    n_step=1,
+    replay=1_000_000,
+    replay_start=640,
+    prioritised=True,
+    explore_share=1.0,
+)
+RECIPES = ("tuned", "paper")  # the first is the default
