@@ -135,8 +135,8 @@ def animate(
                 crosses[i][j].set_text("" if allowed[i, j] else "x")
         row, column = divmod(int(episode.action[t]), shape[1])
         frame.set_xy((shape[1] - 1 - column - 0.5, row - 0.5))
-        state = "" if episode.secure[t] else \n(none below: the least threatening is taken)"
-        table.set_title(f"crossed out: threat above {x:g}{state}", fontsize=10)
+        state = "" if episode.secure[t] else "; none is below: the least"
+        table.set_title(f"crossed: threat above {x:g}{state}", fontsize=10)
         world.set_title(f"step {t}" + (", CRASH" if episode.crashed and t == frames - 1 else ""))
         if on_progress:
             on_progress(t + 1, frames)
