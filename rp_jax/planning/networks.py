@@ -37,12 +37,33 @@ class PaperNetwork(nn.Module):
         """(..., A) action values."""
         scan = seen.scan.astype(seen.rest.dtype) / 255
         scan = jnp.where(scan == 1.0, 0.0, scan)  # the paper's scans say 0 where nothing is seen
-        x = nn.relu(nn.Conv(3, (6,), padding="VALID")(scan[..., None]))
-        x = nn.max_pool(x, (8,), (8,))
-        x = jnp.concatenate([x.reshape(*x.shape[:-2], -1), seen.rest], axis=-1)
+        x = _convolve_and_pool(
+            scan,
+            self.param("kernel", nn.initializers.lecun_normal(), (6, 3)),
+            self.param("bias", nn.initializers.zeros, (3,)),
+        )
+        x = jnp.concatenate([x, seen.rest], axis=-1)
         for width in (50, 20):
             x = nn.tanh(nn.Dense(width)(x))
         return nn.Dense(self.num_actions)(x)
+
+
+def _convolve_and_pool(scan: Array, kernel: Array, bias: Array) -> Array:
+    """Convolution along (..., L) with a kernel (width, channels), relu, and maxima over 8 places.
+
+    The last pool may be partly filled, as in the original's framework. Sums of shifted scans, one
+    channel at a time, run seven times faster on a CPU than XLA's convolution of a single channel.
+    """
+    width, channels = kernel.shape
+    length = scan.shape[-1] - width + 1
+    spare = -length % 8
+    pooled = []
+    for channel in range(channels):
+        shifted = [scan[..., i : i + length] * kernel[i, channel] for i in range(width)]
+        x = nn.relu(sum(shifted) + bias[channel])
+        x = jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, spare)])
+        pooled.append(jnp.max(x.reshape(*x.shape[:-1], -1, 8), axis=-1))
+    return jnp.concatenate(pooled, axis=-1)
 
 
 NETWORKS = {"tuned": TunedNetwork, "paper": PaperNetwork}
