@@ -4,7 +4,8 @@ import argparse
 import dataclasses
 import importlib.util
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -37,7 +38,7 @@ def main(
     first.add_argument("--preset", default="quick")
     first.add_argument("--recipe", default=RECIPES[0])
     chosen, rest = first.parse_known_args(argv)
-    try:
+    with bad_input():
         preset = presets[_among("preset", chosen.preset, presets)]
         config = preset(_among("recipe", chosen.recipe, RECIPES))
         text = (
@@ -54,6 +55,13 @@ def main(
                 "--no-figures"
             )
         return pipeline.run(make_task, config, chosen.preset)
+
+
+@contextmanager
+def bad_input() -> Iterator[None]:
+    """Turns a ValueError into a message and exit code 2, an interruption into one and 130."""
+    try:
+        yield
     except ValueError as error:
         console.console.print(f"[red]error:[/red] {error}", highlight=False, soft_wrap=True)
         raise SystemExit(2) from None

@@ -36,7 +36,7 @@ PAPER_PLANNING = LoopConfig(
         epsilon=1e-2,
         anneal=False,
         polyak=0.0,
-        period=1_000,
+        period=31,  # updates; 1,000 steps, as in the original
         reward_scale=1.0,
     ),
     steps=3_000_000,

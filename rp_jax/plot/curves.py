@@ -81,3 +81,55 @@ def fit_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path) 
         axis.grid(alpha=0.3)
     figure.savefig(path, dpi=120)
     plt.close(figure)
+
+
+def comparison(
+    rows: Sequence[Mapping[str, Any]],
+    *,
+    panels: tuple[str, str],
+    line: str,
+    horizontal: str,
+    vertical: Sequence[str],
+    path: Path,
+) -> None:
+    """Lines of means over repeats, with each repeat as a dot; both axes logarithmic.
+
+    Args:
+        rows: one per measurement.
+        panels: two fields whose values name a panel's column.
+        line: field whose values name the lines.
+        horizontal: field of the horizontal axis.
+        vertical: fields of the vertical axes, one row of panels each.
+        path: of the PNG.
+    """
+    columns = list(dict.fromkeys(tuple(row[name] for name in panels) for row in rows))
+    figure, axes = plt.subplots(
+        len(vertical),
+        len(columns),
+        figsize=(3.6 * len(columns), 3.1 * len(vertical)),
+        layout="constrained",
+        squeeze=False,
+    )
+    for i, quantity in enumerate(vertical):
+        for j, column in enumerate(columns):
+            axis = axes[i, j]
+            here = [row for row in rows if tuple(row[name] for name in panels) == column]
+            for colour, name in zip(
+                (GREY, RED, BLUE), dict.fromkeys(r[line] for r in here), strict=False
+            ):
+                of = [row for row in here if row[line] == name]
+                places = sorted({row[horizontal] for row in of})
+                means = [np.mean([r[quantity] for r in of if r[horizontal] == p]) for p in places]
+                axis.plot(places, means, color=colour, label=name)
+                axis.plot([r[horizontal] for r in of], [r[quantity] for r in of], ".", color=colour)
+            axis.set_xscale("log")
+            axis.set_yscale("log" if all(r[quantity] > 0 for r in here) else "linear")
+            axis.set_xlabel(f"labelled {horizontal}")
+            axis.grid(alpha=0.3, which="both")
+            if i == 0:
+                axis.set_title(", ".join(column), fontsize=10)
+            if j == 0:
+                axis.set_ylabel(quantity.replace("_", " "))
+                axis.legend()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
