@@ -40,6 +40,7 @@ def measure(
     function: Callable[..., Any],
     *arguments: Any,
     repeats: int = 5,
+    carried: bool = False,
 ) -> Row:
     """Compiles `function`, runs it once to warm up, then `repeats` times.
 
@@ -51,16 +52,20 @@ def measure(
         function: to be jitted; its result is waited for.
         *arguments: of the call.
         repeats: timed calls.
+        carried: the first result is the next call's first argument, and its memory is given away.
     """
     began = time.perf_counter()
-    compiled = jax.jit(function).lower(*arguments).compile()
+    given = (0,) if carried else ()
+    compiled = jax.jit(function, donate_argnums=given).lower(*arguments).compile()
     compile_seconds = time.perf_counter() - began
-    jax.block_until_ready(compiled(*arguments))
     rates = []
-    for _ in range(repeats):
+    for _ in range(repeats + 1):
         began = time.perf_counter()
-        jax.block_until_ready(compiled(*arguments))
+        result = jax.block_until_ready(compiled(*arguments))
         rates.append(count / (time.perf_counter() - began))
+        if carried:
+            arguments = (result[0], *arguments[1:])
+    rates = rates[1:]  # the first call warms up
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return Row(
         name, unit, batch, statistics.median(rates), min(rates), max(rates), compile_seconds, peak

@@ -21,7 +21,9 @@ def run() -> list[Row]:
 
         count = ITERATIONS * planning.num_envs
         title = f"{name}, {planning.samples_per_step:g} samples a step"
-        rows.append(measure(title, "steps", planning.num_envs, count, program, state, pmdp))
+        rows.append(
+            measure(title, "steps", planning.num_envs, count, program, state, pmdp, carried=True)
+        )
     return rows
 
 

@@ -3,6 +3,7 @@
 python -m experiments.circuit --preset quick
 """
 
+import dataclasses
 from dataclasses import dataclass, field
 
 import jax
@@ -31,12 +32,12 @@ def quick(recipe: str) -> Config:
 
 def full(recipe: str) -> Config:
     """What committed results are made with."""
-    return cli.override(quick(recipe), seeds=10 if recipe == "tuned" else 1, episodes=20_000)
+    return dataclasses.replace(quick(recipe), seeds=10 if recipe == "tuned" else 1, episodes=20_000)
 
 
 def paper(config: Config) -> Config:
     """The paper's architectures and hyperparameters (appendix G.1)."""
-    return cli.override(config, wall=recipes.PAPER_WALL, planning=recipes.PAPER_PLANNING)
+    return dataclasses.replace(config, wall=recipes.PAPER_WALL, planning=recipes.PAPER_PLANNING)
 
 
 def make_task(config: Config) -> pipeline.Task:
@@ -60,32 +61,24 @@ def draw(run: pipeline.Finished) -> None:
     from rp_jax.plot import scenes
 
     bar, folder = run.bar, run.folder
-    bar("", 0, 4, "curves")
+    bar("still", 0, 3, "curves")
     drawing.curves_of(run)
-    bar("", 1, 4, "trajectories")
+    bar("still", 1, 3, "trajectories")
     panels = []
     for variant, params in run.task.tests.items():
         demo = circuit.demo_start(params)
-        keys = jax.random.split(pipeline.key_of(run.config.seed, pipeline.MEDIA), 7)
+        keys = jax.random.split(pipeline.key_of(run.config.seed, pipeline.STARTS), 7)
         starts = jax.vmap(circuit.reset, (0, None))(keys, params)
         starts = jax.tree.map(lambda a, b: jax.numpy.concatenate([a[None], b]), demo, starts)
         episodes = drawing.play(run, params, starts, int(params.time_limit), None)
         panels.append((variant, scenes.Scene(np.asarray(params.track.walls)), episodes))
     scenes.trajectories(panels, folder / "trajectories.png")
     if run.pmdp.threats:
-        bar("", 2, 4, "threat maps")
+        bar("still", 2, 3, "threat maps")
         draw_maps(run)
-    bar("", 3, 4, "animation")
+    bar("still", 3, 3)
     _, scene, episodes = panels[0]
-    scenes.animate(
-        scene,
-        episodes[0],
-        circuit.ACCELERATIONS,
-        circuit.TURNS,
-        run.config.x,
-        folder.parent / "animation.gif",
-    )
-    bar("", 4, 4, "")
+    drawing.animation(run, scene, episodes[0])
 
 
 def draw_maps(run: pipeline.Finished) -> None:
@@ -93,14 +86,7 @@ def draw_maps(run: pipeline.Finished) -> None:
     from experiments import drawing
     from rp_jax.plot import maps
 
-    speeds = [0.1, 0.04, -0.04]
-    panels = drawing.threat_of_one(
-        run,
-        "wall",
-        [f"wall point, agent at {v:g}" for v in speeds],
-        lambda p, i: np.concatenate([p, np.full((len(p), 1), speeds[i])], axis=-1),
-    )
-    maps.heat_maps(panels, run.config.x, run.folder / "threat_of_one_wall_point.png")
+    drawing.wall_maps(run, (0.1, 0.04, -0.04))
     walls = np.asarray(run.pmdp.params.track.walls)
     (left, bottom), (right, top) = walls.min(axis=0) - 0.1, walls.max(axis=0) + 0.1
     velocities = {

@@ -1,20 +1,18 @@
 """The command line of an experiment: a preset, and any setting overridden."""
 
 import argparse
-import dataclasses
 import importlib.util
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import tyro
 
 from experiments import console, pipeline
 from experiments.recipes import RECIPES
-
-C = TypeVar("C")
+from rp_jax.validate import one_of
 
 
 def main(
@@ -39,8 +37,8 @@ def main(
     first.add_argument("--recipe", default=RECIPES[0])
     chosen, rest = first.parse_known_args(argv)
     with bad_input():
-        preset = presets[_among("preset", chosen.preset, presets)]
-        config = preset(_among("recipe", chosen.recipe, RECIPES))
+        preset = presets[one_of("preset", chosen.preset, presets)]
+        config = preset(one_of("recipe", chosen.recipe, RECIPES))
         text = (
             f"{about}\n\n--preset {{{','.join(presets)}}} (default quick) and --recipe "
             f"{{{','.join(RECIPES)}}} (default {RECIPES[0]}) choose the values below; any of "
@@ -54,38 +52,20 @@ def main(
                 "figures is True; it needs matplotlib (pip install 'rp_jax[plot]'), or say "
                 "--no-figures"
             )
-        return pipeline.run(make_task, config, chosen.preset)
+        task, folder = pipeline.prepare(make_task, config, chosen.preset)
+    try:
+        pipeline.run(task, config, chosen.preset, folder)
+    except KeyboardInterrupt:
+        console.console.print(f"[yellow]interrupted[/yellow]: what was finished is in {folder}")
+        raise SystemExit(130) from None
+    return folder
 
 
 @contextmanager
 def bad_input() -> Iterator[None]:
-    """Turns a ValueError into a message and exit code 2, an interruption into one and 130."""
+    """Turns a ValueError into a message and exit code 2."""
     try:
         yield
     except ValueError as error:
         console.console.print(f"[red]error:[/red] {error}", highlight=False, soft_wrap=True)
         raise SystemExit(2) from None
-    except KeyboardInterrupt:
-        console.console.print("[yellow]interrupted[/yellow]: what was finished is kept")
-        raise SystemExit(130) from None
-
-
-def _among(field: str, value: str, allowed: Any) -> str:
-    if value not in allowed:
-        raise ValueError(f"{field} is {value!r}; it must be one of {', '.join(allowed)}")
-    return value
-
-
-def override(config: C, **changes: Any) -> C:
-    """A copy with some fields changed; nested ones are named a__b."""
-    nested: dict[str, dict[str, Any]] = {}
-    flat = {}
-    for name, value in changes.items():
-        head, _, tail = name.partition("__")
-        if tail:
-            nested.setdefault(head, {})[tail] = value
-        else:
-            flat[name] = value
-    for head, inner in nested.items():
-        flat[head] = override(getattr(config, head), **inner)
-    return dataclasses.replace(config, **flat)  # type: ignore[type-var]

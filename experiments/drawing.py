@@ -31,20 +31,22 @@ def play(
     network = loop.make_network(run.config.planning, pmdp)
     weights = jax.tree.map(lambda a: a[0], run.trained.params)
 
+    # One row more than steps, so that the state after the last one is seen too.
+    rows = steps + 1
+
     @jax.jit
     def go(key, pmdp, weights, starts):
-        return evaluate.record(key, pmdp, evaluate.greedy(network, weights), starts, steps)
+        return evaluate.record(key, pmdp, evaluate.greedy(network, weights), starts, rows)
 
     shown = jax.tree.map(np.asarray, go(key_of(run.config.seed, MEDIA), pmdp, weights, starts))
     count = shown.alive.shape[1]
-    empty = np.zeros((steps, count, 0, 2))
+    empty = np.zeros((rows, count, 0, 2))
     others = obstacles(shown.states) if obstacles else None
     crash = jax.jit(jax.vmap(run.task.env.causes, (0, None)))
     episodes = []
     for i in range(count):
-        length = int(shown.alive[:, i].sum())
-        # The state after the last step stands in the next row, where there is one.
-        end = min(length + 1, steps)
+        # The state after the last step stands in the row after it.
+        end = min(int(shown.alive[:, i].sum()), steps) + 1
         at = lambda a, i=i, end=end: np.asarray(a)[:end, i]  # noqa: E731
         last = jax.tree.map(lambda a, i=i, end=end: jnp.asarray(a[end - 1 : end, i]), shown.states)
         hit = any(bool(v[0]) for v in crash(last, params).values())
@@ -120,3 +122,28 @@ def threat_of_all(
         threat = np.concatenate(parts).reshape(len(ys), len(xs))
         panels.append(maps.Panel(title, threat, box))
     return panels
+
+
+def wall_maps(run: Finished, speeds: Sequence[float]) -> None:
+    """threat_of_one_wall_point.png, the agent at several speeds."""
+    panels = threat_of_one(
+        run,
+        "wall",
+        [f"wall point, agent at {speed:g}" for speed in speeds],
+        lambda places, i: np.concatenate([places, np.full((len(places), 1), speeds[i])], axis=-1),
+    )
+    maps.heat_maps(panels, run.config.x, run.folder / "threat_of_one_wall_point.png")
+
+
+def animation(run: Finished, scene: scenes.Scene, episode: scenes.Episode) -> None:
+    """animation.gif, beside the folder of figures."""
+    env: Any = run.task.env
+    scenes.animate(
+        scene,
+        episode,
+        env.ACCELERATIONS,
+        env.TURNS,
+        run.config.x,
+        run.folder.parent / "animation.gif",
+        lambda done, total: run.bar("animation", done, total),
+    )

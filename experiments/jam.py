@@ -3,6 +3,7 @@
 python -m experiments.jam --preset quick
 """
 
+import dataclasses
 from dataclasses import dataclass, field
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 
 from experiments import cli, pipeline, recipes
 from rp_jax.envs import jam
+from rp_jax.kinematics import Vehicle
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.threat.build import ThreatConfig
 
@@ -32,12 +34,12 @@ def quick(recipe: str) -> Config:
 
 def full(recipe: str) -> Config:
     """What committed results are made with."""
-    return cli.override(quick(recipe), seeds=10 if recipe == "tuned" else 1, episodes=20_000)
+    return dataclasses.replace(quick(recipe), seeds=10 if recipe == "tuned" else 1, episodes=20_000)
 
 
 def paper(config: Config) -> Config:
     """The paper's architectures and hyperparameters (appendix G.1)."""
-    return cli.override(
+    return dataclasses.replace(
         config,
         wall=recipes.PAPER_WALL,
         obstacle=recipes.PAPER_OBSTACLE,
@@ -65,30 +67,36 @@ def draw(run: pipeline.Finished) -> None:
     from experiments import drawing
     from rp_jax.plot import scenes
 
-    bar, x, folder = run.bar, run.config.x, run.folder
-    bar("", 0, 4, "curves")
+    bar, folder = run.bar, run.folder
+    bar("still", 0, 3, "curves")
     drawing.curves_of(run)
-    zones = [(0, 0, 0.5, 0.5), (0, 2.5, 0.5, 0.5), (2.5, 0, 0.5, 0.5)]
-    scene = scenes.Scene(jam.wall_points(), zones)
-    bar("", 1, 4, "trajectories")
+    corners = [(0.0, 0.0), (0.0, jam.ROOM), (jam.ROOM, 0.0)]
+    scene = scenes.Scene(jam.wall_points(), corners, jam.ZONE, run.config.fidelity == "paper")
+    bar("still", 1, 3, "trajectories")
     panels = []
     for variant, test in run.task.tests.items():
-        keys = jax.random.split(pipeline.key_of(run.config.seed, pipeline.MEDIA), 20)
+        keys = jax.random.split(pipeline.key_of(run.config.seed, pipeline.STARTS), 20)
         starts = jax.vmap(jam.reset, (0, None))(keys, test)
         limit = int(test.time_limit)
-        episodes = drawing.play(run, test, starts, limit, lambda s: s.obstacles)
+        episodes = drawing.play(run, test, starts, limit, present_obstacles)
         panels.append((variant, scene, episodes))
         if variant == f"N={run.config.obstacles}" or len(panels) == 1:
             shown = episodes
     scenes.trajectories(panels, folder / "trajectories.png")
     if run.pmdp.threats:
-        bar("", 2, 4, "threat maps")
+        bar("still", 2, 3, "threat maps")
         draw_maps(run)
-    bar("", 3, 4, "animation")
+    bar("still", 3, 3)
     ended = [e for e in shown if len(e.action) < limit] or shown
     longest = max(ended, key=lambda e: len(e.action))
-    scenes.animate(scene, longest, jam.ACCELERATIONS, jam.TURNS, x, folder.parent / "animation.gif")
-    bar("", 4, 4, "")
+    drawing.animation(run, scene, longest)
+
+
+def present_obstacles(states: jam.State) -> Vehicle:
+    """The obstacles, those that have disappeared at nan, which is not drawn."""
+    shown = states.present[..., None]
+    position = np.where(shown, states.obstacles.position, np.nan)
+    return states.obstacles.replace(position=position)
 
 
 def draw_maps(run: pipeline.Finished) -> None:
@@ -109,15 +117,8 @@ def draw_maps(run: pipeline.Finished) -> None:
 
     panels = drawing.threat_of_one(run, "obstacle", titles, features)
     maps.heat_maps(panels, run.config.x, run.folder / "threat_of_one_obstacle.png")
-    speeds = [0.1, 0.0, -0.1]
-    walls = drawing.threat_of_one(
-        run,
-        "wall",
-        [f"wall point, agent at {v:g}" for v in speeds],
-        lambda p, i: np.concatenate([p, np.full((len(p), 1), speeds[i])], axis=-1),
-    )
-    maps.heat_maps(walls, run.config.x, run.folder / "threat_of_one_wall_point.png")
-    key = pipeline.key_of(run.config.seed, pipeline.MEDIA)
+    drawing.wall_maps(run, (0.1, 0.0, -0.1))
+    key = pipeline.key_of(run.config.seed, pipeline.STARTS)
     state = jam.reset(key, run.pmdp.params)
     velocities = {
         "heading 45 deg, speed 0.1": (np.pi / 4, 0.1),

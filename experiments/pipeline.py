@@ -1,9 +1,7 @@
 """The main job, task by task: reconnaissance, threat models, planning, evaluation, figures."""
 
-import csv
 import dataclasses
 import datetime
-import io
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import rp_jax
-from experiments import console
-from rp_jax import evaluate, statistics, storage
+from experiments import console, tables
+from rp_jax import evaluate, shield, storage
 from rp_jax.envs.base import Env
 from rp_jax.planning import loop
 from rp_jax.planning.loop import LoopConfig
@@ -29,26 +27,8 @@ from rp_jax.threat.build import ThreatConfig
 from rp_jax.threat.total import total_threat
 from rp_jax.validate import number, one_of
 
-THREAT, PLANNING, EVALUATION, MEDIA = range(4)  # streams of random numbers, all apart
+THREAT, SUMS, PLANNING, EVALUATION, STARTS, MEDIA = range(6)  # streams of random numbers, apart
 CHUNKS = 30  # of a training run: points of its curves
-TABLE = [
-    "env",
-    "variant",
-    "method",
-    "seed",
-    "episodes",
-    "return_mean",
-    "return_ci95",
-    "uncrashed_return_mean",
-    "crashes",
-    "crash_rate",
-    "crash_upper95",
-    "goal_rate",
-    "interventions",
-    "insecure",
-    "seconds_per_100_actions",
-    "train_seconds",
-]
 
 
 @dataclass(frozen=True)
@@ -142,7 +122,7 @@ def learn_threats(task: Task, config: Config, folder: Path) -> tuple[dict, dict,
     models = {kind: b.model for kind, b in built.items()}
     reports = {kind: b.report for kind, b in built.items()}
     timings = {kind: b.seconds for kind, b in built.items()}
-    sums = sum_reports(key_of(config.seed, THREAT), task, config, models)
+    sums = sum_reports(key_of(config.seed, SUMS), task, config, models)
     curves = {kind: b.curve for kind, b in built.items()}
     about = {
         "x": config.x,
@@ -155,18 +135,7 @@ def learn_threats(task: Task, config: Config, folder: Path) -> tuple[dict, dict,
     artefact.save(folder / "threat", task.name, models, subs, about)
     rows = [{"hazard": kind, "of": "one", **found} for kind, found in reports.items()]
     rows += [{"hazard": kind, "of": "sum", **found} for kind, found in sums.items()]
-    shown = [
-        {
-            "hazard": row["hazard"],
-            "of": row["of"],
-            **{name: row[name] for name in ("mae", "rmse", "bias", "spearman")},
-            "unsafe called safe": f"{100 * row['unsafe_called_safe']:.2f} %",
-            "safe called unsafe": f"{100 * row['safe_called_unsafe']:.2f} %",
-        }
-        for row in rows
-    ]
-    title = f"threat models against fresh labels (x = {config.x:g})"
-    console.table(title, shown, list(shown[0]))
+    tables.show_threats(rows, config.x)
     storage.write_json(folder / "threat" / "report.json", rows)
     storage.write_json(folder / "threat" / "curves.json", curves)
     return models, curves, timings
@@ -215,15 +184,14 @@ def method_name(config: Config) -> str:
 def plan(task: Task, config: Config, models: Mapping, folder: Path) -> Trained:
     """Trains all seeds as one program; writes metrics.jsonl as it goes."""
     planning = config.planning
-    length = max(1, planning.iterations // CHUNKS)
-    chunks = -(-planning.iterations // length)
-    updates = chunks * length * planning.updates
-    learner = dataclasses.replace(planning.learner, total_updates=updates)
-    planning = dataclasses.replace(planning, learner=learner)
+    warm = -(-planning.replay_start // planning.num_envs)  # iterations before learning
+    length = -(-max(1, planning.iterations - warm) // CHUNKS)
+    chunks = -(-max(1, planning.iterations - warm) // length)
+    steps = (warm + chunks * length) * planning.num_envs
     pmdp = make_pmdp(task, config, models, task.train)
     keys = jnp.stack([key_of(config.seed + i, PLANNING) for i in range(config.seeds)])
     console.console.print(
-        f"planning: {config.seeds} seed(s) x {chunks * length * planning.num_envs:,} steps, "
+        f"planning: {config.seeds} seed(s) x {steps:,} steps, "
         f"{planning.samples_per_step:g} samples replayed per step, {method_name(config)}"
     )
     history: list[dict[str, Any]] = []
@@ -341,8 +309,8 @@ def action_seconds(pmdp: PMDP, network: Any, params: Any) -> float:
     @jax.jit
     def act(states, weights, pmdp):
         percept = pmdp.perceive(states)
-        values = network.apply(weights, percept.encoded)
-        return jnp.argmax(jnp.where(percept.admissible, values, -jnp.inf), axis=-1)
+        values = evaluate.greedy(network, weights)(percept)
+        return jax.vmap(shield.masked_argmax)(values, percept.admissible)
 
     act(state, weights, pmdp).block_until_ready()
     began = time.perf_counter()
@@ -351,68 +319,11 @@ def action_seconds(pmdp: PMDP, network: Any, params: Any) -> float:
     return time.perf_counter() - began
 
 
-def over_seeds(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Per variant, means and intervals over the seeds, and all crashes together."""
-    found = []
-    for variant in dict.fromkeys(row["variant"] for row in rows):
-        of = [row for row in rows if row["variant"] == variant]
-        mean, width = statistics.mean_interval(np.asarray([row["return_mean"] for row in of]))
-        n, k = sum(r["episodes"] for r in of), sum(r["crashes"] for r in of)
-        low, high = statistics.clopper_pearson(k, n)
-        found.append(
-            {
-                "variant": variant,
-                "seeds": len(of),
-                "return_mean": mean,
-                "return_ci95": width,
-                "crashes": k,
-                "episodes": n,
-                "crash_rate": k / n,
-                "crash_lower95": low,
-                "crash_upper95": high,
-            }
-        )
-    return found
-
-
-def write_tables(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """table.json, table.csv, and the same on the terminal."""
-    storage.write_json(folder / "table.json", rows)
-    text = io.StringIO()
-    writer = csv.DictWriter(text, TABLE, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    storage.write_bytes(folder / "table.csv", text.getvalue().encode())
-    shown = [readable(row) for row in rows]
-    console.table(f"{rows[0]['env']}: {rows[0]['method']}", shown, list(shown[0]))
-    if len({row["seed"] for row in rows}) > 1:
-        summary = over_seeds(rows)
-        storage.write_json(folder / "summary.json", summary)
-        shown = [readable({**row, "seed": "all"}) for row in summary]
-        console.table("over seeds", shown, list(shown[0]))
-
-
-def readable(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row of the table, in few enough columns for a terminal."""
-    low, high = 100 * row["crash_lower95"], 100 * row["crash_upper95"]
-    cells = {
-        "case": row["variant"],
-        "seed": row["seed"],
-        "return": f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}",
-        "crashes": f"{row['crashes']:,} of {row['episodes']:,}",
-        "% [95 %]": f"{100 * row['crash_rate']:.2f} [{low:.2f}, {high:.2f}]",
-    }
-    if "goal_rate" in row:
-        cells["goal"] = f"{row['goal_rate']:.3f}"
-        cells["s/100"] = f"{row['seconds_per_100_actions']:.2f}"
-    return cells
-
-
-def run(make_task: Callable[[Any], Task], config: Config, preset: str) -> Path:
-    """The whole job. Everything that can be wrong with the input is found before any long work.
+def prepare(make_task: Callable[[Any], Task], config: Config, preset: str) -> tuple[Task, Path]:
+    """Finds everything that can be wrong with the input, before any long work.
 
     Returns:
-        the folder of results.
+        the task and the new folder for its results.
 
     Raises:
         ValueError: a setting is out of range, or a file cannot be used.
@@ -423,7 +334,11 @@ def run(make_task: Callable[[Any], Task], config: Config, preset: str) -> Path:
         threat.validate(kind)
     if config.threat is not None:
         artefact.load(config.threat, task.name, task.env.sub_rmdps(task.train))
-    folder = storage.new_folder(config.out or default_out(task.name, preset))
+    return task, storage.new_folder(config.out or default_out(task.name, preset))
+
+
+def run(task: Task, config: Config, preset: str, folder: Path) -> None:
+    """The whole job, into a prepared folder."""
     began = time.perf_counter()
     settings = {
         "preset": preset,
@@ -433,34 +348,34 @@ def run(make_task: Callable[[Any], Task], config: Config, preset: str) -> Path:
         "device": str(jax.devices()[0]),
     }
     storage.write_json(folder / "config.json", settings)
-    models, curves, timings = learn_threats(task, config, folder)
-    recon_seconds = time.perf_counter() - began
+    models, curves, parts = learn_threats(task, config, folder)
+    reconnaissance = time.perf_counter() - began
     trained = plan(task, config, models, folder)
     rows = evaluate_all(task, config, models, trained)
-    write_tables(folder, rows)
-    inadmissible = sum(row["inadmissible"] for row in trained.history)
-    steps = sum(row["steps"] for row in trained.history[-config.seeds :])
-    crashes = sum(row["crashes"] for row in trained.history)
-    seconds = {
-        "reconnaissance": recon_seconds,
-        "reconnaissance_parts": timings,
-        "planning": trained.seconds,
-        "planning_compilation": trained.compile_seconds,
-        "total_before_figures": time.perf_counter() - began,
+    tables.write(folder, rows)
+    training = {
+        "steps": sum(row["steps"] for row in trained.history[-config.seeds :]),
+        "crashes": sum(row["crashes"] for row in trained.history),
+        "episodes": sum(row["episodes"] for row in trained.history),
+        "inadmissible": sum(row["inadmissible"] for row in trained.history),
+        "seconds": {
+            "reconnaissance": reconnaissance,
+            "reconnaissance_parts": parts,
+            "planning": trained.seconds,
+            "planning_compilation": trained.compile_seconds,
+            "total_before_figures": time.perf_counter() - began,
+        },
     }
-    storage.write_json(
-        folder / "training.json",
-        {"steps": steps, "crashes": crashes, "inadmissible": inadmissible, "seconds": seconds},
-    )
+    storage.write_json(folder / "training.json", training)
     console.console.print(
-        f"training: {steps:,} steps, {crashes} crashes, {inadmissible} inadmissible actions "
+        f"training: {training['steps']:,} steps, {training['crashes']} crashes in "
+        f"{training['episodes']:,} episodes, {training['inadmissible']} inadmissible actions "
         f"taken; {trained.seconds:.1f} s after {trained.compile_seconds:.1f} s of compilation"
     )
     if config.figures and task.draw is not None:
-        (folder / "figures").mkdir()
+        figures = folder / "figures"
+        figures.mkdir()
         with console.progress("figures") as bar:
             pmdp = make_pmdp(task, config, models, task.train)
-            figures = folder / "figures"
             task.draw(Finished(task, config, pmdp, trained, rows, curves, figures, bar))
     console.console.print(f"results: {folder}")
-    return folder

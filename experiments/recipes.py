@@ -17,16 +17,33 @@ TUNED_OBSTACLE = ThreatConfig(
     fit=FitConfig(hidden=(128, 128, 128), steps=12_000, batch=1024, learning_rate=3e-3),
 )
 
-# Appendix G.1: 100,000 states, 20 and 25 epochs of batches of 512. The labels of static hazards
-# are exact, and stand for the paper's 10,000 paths a state; those of moving ones come from fewer.
+# Appendix G.1: 100,000 states and their mirror images, 20 and 25 epochs of batches of 512. The
+# labels of static hazards are exact, and stand for the paper's 10,000 paths a state; those of
+# moving ones come from fewer.
 PAPER_WALL = ThreatConfig(
     states=100_000,
-    fit=FitConfig((100, 50), "relu", 3_900, 512, 1e-2, 1e-2, cosine=False),
+    fit=FitConfig(
+        hidden=(100, 50),
+        activation="relu",
+        steps=7_400,
+        batch=512,
+        learning_rate=1e-2,
+        epsilon=1e-2,
+        cosine=False,
+    ),
 )
 PAPER_OBSTACLE = ThreatConfig(
     states=100_000,
     paths=1_000,
-    fit=FitConfig((500, 500, 500), "relu", 4_900, 512, 1e-3, 1e-2, cosine=False),
+    fit=FitConfig(
+        hidden=(500, 500, 500),
+        activation="relu",
+        steps=9_300,
+        batch=512,
+        learning_rate=1e-3,
+        epsilon=1e-2,
+        cosine=False,
+    ),
 )
 PAPER_PLANNING = LoopConfig(
     network="paper",
@@ -36,7 +53,7 @@ PAPER_PLANNING = LoopConfig(
         epsilon=1e-2,
         anneal=False,
         polyak=0.0,
-        period=31,  # updates; 1,000 steps, as in the original
+        period=31,  # updates; 992 steps, where the original has 1,000
         reward_scale=1.0,
     ),
     steps=3_000_000,

@@ -43,15 +43,15 @@ class Config:
 
 def test_sets(key: jax.Array, sub: SubRMDP, config: Config, x: float) -> dict[str, Any]:
     """Fresh labelled states, the same for all: spread over the window, and where it matters."""
-    keys = jax.random.split(key, 4)
+    keys = jax.random.split(key, 5)
     pool = sampling.uniform(keys[0], sub, 10 * config.test_states)
     rough = _label(keys[1], sub, pool, 256)
     order = np.argsort(-np.asarray(sampling.interest(rough, x)))[: config.test_states]
     spread = sampling.uniform(keys[2], sub, config.test_states)
-    sets = {"over the window": spread, "where it matters": pool[order]}
+    hard = pool[order]
     return {
-        name: (features, np.asarray(_label(keys[3], sub, features, 8192)))
-        for name, features in sets.items()
+        "over the window": (spread, np.asarray(_label(keys[3], sub, spread, 8192))),
+        "where it matters": (hard, np.asarray(_label(keys[4], sub, hard, 8192))),
     }
 
 

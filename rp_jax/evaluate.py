@@ -38,7 +38,6 @@ def run_episodes(
     episodes: int,
     *,
     batch: int = 1000,
-    start: Callable[[Array, Any], Any] | None = None,
 ) -> Episodes:
     """Acts greedily inside the admissible set until each episode ends.
 
@@ -48,17 +47,17 @@ def run_episodes(
         values: scores the actions of a batch of states; any policy can be written so.
         episodes: how many.
         batch: episodes simulated side by side.
-        start: draws a start state from (key, params); the environment's reset if not given.
 
     Returns:
         Rows with leading axis (episodes,).
     """
-    reset = start if start is not None else pmdp.env.reset
     rounds = -(-episodes // batch)
 
     def one_round(key: Array) -> Episodes:
-        keys = jax.random.split(key, batch)
-        states = jax.vmap(reset, (0, None))(keys, pmdp.params)
+        start_key, step_key = jax.random.split(key)
+        keys = jax.random.split(step_key, batch)
+        starts = jax.random.split(start_key, batch)
+        states = jax.vmap(pmdp.env.reset, (0, None))(starts, pmdp.params)
         zeros = jnp.zeros(batch, pmdp.x.dtype)
         none = jnp.zeros(batch, bool)
         causes = dict.fromkeys(pmdp.env.sub_rmdps(pmdp.params), none)
@@ -97,6 +96,9 @@ def run_episodes(
 def summarise(rows: Episodes, penalty: float) -> dict[str, Any]:
     """What is reported of some episodes; returns are over all of them, penalty included.
 
+    `crash_ci95` is the two-sided Clopper-Pearson interval of the crash rate, `crash_upper95` the
+    one-sided bound: what these episodes exclude.
+
     Args:
         rows: arrays (n,).
         penalty: taken off the return of an episode per unit of danger.
@@ -115,8 +117,8 @@ def summarise(rows: Episodes, penalty: float) -> dict[str, Any]:
         "uncrashed_return_mean": float(rows.score[safe].mean()) if safe.any() else float("nan"),
         "crashes": k,
         "crash_rate": k / n,
-        "crash_lower95": low,
-        "crash_upper95": high,
+        "crash_ci95": [low, high],
+        "crash_upper95": statistics.upper_bound(k, n),
         "goal_rate": float(rows.goal.mean()),
         "interventions": float(rows.interventions.sum() / steps),
         "insecure": float(rows.insecure.sum() / steps),

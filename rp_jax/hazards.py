@@ -67,10 +67,10 @@ class Window(struct.PyTreeNode):
     upper: Array  # (2,)
 
     def contains(self, relative: Array) -> Array:
-        """(...) bool for relative positions (..., 2)."""
+        """(...) bool for relative positions (..., 2). Nan counts as inside: it must be noticed."""
         x, y = relative[..., 0], relative[..., 1]
-        along = (x >= self.lower[0]) & (x <= self.upper[0])
-        return along & (y >= self.lower[1]) & (y <= self.upper[1])
+        outside = (x < self.lower[0]) | (x > self.upper[0])
+        return ~(outside | (y < self.lower[1]) | (y > self.upper[1]))
 
 
 class SubRMDP(struct.PyTreeNode):
@@ -225,5 +225,6 @@ class MovingObstacle(struct.PyTreeNode):
 
     def state_of(self, features: Array) -> tuple[Vehicle, Vehicle]:
         """See `HazardSource`."""
-        hazard = Vehicle(position=features[:2], heading=features[2:4], speed=features[4])
+        heading = features[2:4] / jnp.sqrt(squared_distance(features[2:4], jnp.zeros(2)))
+        hazard = Vehicle(position=features[:2], heading=heading, speed=features[4])
         return make_vehicle(jnp.zeros(2), 0.0, features[5]), hazard

@@ -5,6 +5,7 @@ Primitives are unbatched: threats and values are (A,), masks (A,) bool.
 
 from typing import NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -26,6 +27,7 @@ def shield(threat: Array, x: Array | float) -> Shield:
         threat: (A,) action threats T(s, .).
         x: threshold; infinity switches the shield off.
     """
+    chex.assert_rank([threat, x], [1, 0])
     allowed = threat <= x
     secure = jnp.any(allowed)
     fallback = jnp.arange(threat.shape[0]) == greedy_eta(threat)
@@ -37,13 +39,9 @@ def greedy_eta(threat: Array) -> Array:
     return jnp.argmin(jnp.where(jnp.isnan(threat), jnp.inf, threat))
 
 
-def masked_max(values: Array, admissible: Array) -> Array:
-    """() max of `values` (A,) over the admissible actions (Algorithm 4, line 6)."""
-    return jnp.max(jnp.where(admissible, values, -jnp.inf))
-
-
 def masked_argmax(values: Array, admissible: Array) -> Array:
-    """() int, the admissible action of the greatest value."""
+    """() int, the admissible action of the greatest value (Algorithm 4, line 6)."""
+    chex.assert_rank([values, admissible], 1)
     return jnp.argmax(jnp.where(admissible, values, -jnp.inf))
 
 
@@ -56,7 +54,14 @@ def masked_sample(key: Array, admissible: Array) -> Array:
 
 
 def to_bits(admissible: Array) -> Array:
-    """() int32, the mask (A,) as one integer, for storage; A <= 31."""
+    """() int32, the mask (A,) as one integer, for storage.
+
+    Raises:
+        ValueError: there are more than 31 actions.
+    """
+    chex.assert_rank(admissible, 1)
+    if admissible.shape[0] > 31:
+        raise ValueError(f"admissible has {admissible.shape[0]} actions; it must have at most 31")
     return jnp.sum(jnp.where(admissible, 1 << jnp.arange(admissible.shape[0]), 0))
 
 

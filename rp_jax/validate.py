@@ -1,6 +1,7 @@
 """Checks of user input: every message names the field, the value and what is allowed."""
 
 import math
+import numbers
 from collections.abc import Iterable
 from typing import TypeVar
 
@@ -43,9 +44,9 @@ def number(
         rules.append(f"above {above:g}")
     if most is not None:
         rules.append(f"at most {most:g}")
-    good = isinstance(value, int | float) and not isinstance(value, bool)
+    kind = numbers.Integral if integer else numbers.Real
+    good = isinstance(value, kind) and not isinstance(value, bool)
     good = good and not math.isnan(value) and (infinite or math.isfinite(value))
-    good = good and (not integer or value == int(value))
     good = good and (least is None or value >= least) and (most is None or value <= most)
     good = good and (above is None or value > above)
     if not good:

@@ -101,10 +101,15 @@ def renew(where: Array, rows: Any, make: Callable[[Array], Any], chunk: int = 16
     return jax.lax.while_loop(lambda c: c[0] < rank[-1], some, (0, rows))[1]
 
 
-def auto_reset_step(
-    env: Env, keys: Array, states: Any, actions: Array, params: Any
-) -> tuple[Any, Any, Outcome]:
-    """A step of a batch that draws a fresh start wherever an episode has ended.
+def step_and_renew(
+    env: Env,
+    keys: Array,
+    states: Any,
+    actions: Array,
+    params: Any,
+    look: Callable[[Any], Any],
+) -> tuple[tuple[Any, Any], tuple[Any, Any], Outcome]:
+    """`auto_reset_step` that also looks at the states; at fresh starts only where they are needed.
 
     Args:
         env: the environment.
@@ -112,16 +117,33 @@ def auto_reset_step(
         states: leading axis (B,).
         actions: (B,) int.
         params: of the environment, unbatched.
+        look: maps a batch of states, of any size, to a pytree of rows.
 
     Returns:
-        (carried, reached, outcome): `carried` are the states to go on from, newly drawn after an
-        end; `reached` are the states the step led to, terminal ones included.
+        (carried, reached, outcome); the first two are pairs (states, look(states)).
     """
     both = jax.vmap(jax.random.split)(keys)
     step = jax.vmap(env.step, (0, 0, 0, None))
     reached, outcome = step(both[:, 0], states, actions, params)
 
     def starts(rows: Array) -> Any:
-        return jax.vmap(env.reset, (0, None))(both.at[rows, 1].get(mode="clip"), params)
+        fresh = jax.vmap(env.reset, (0, None))(both.at[rows, 1].get(mode="clip"), params)
+        return fresh, look(fresh)
 
-    return renew(outcome.done, reached, starts), reached, outcome
+    seen = (reached, look(reached))
+    return renew(outcome.done, seen, starts), seen, outcome
+
+
+def auto_reset_step(
+    env: Env, keys: Array, states: Any, actions: Array, params: Any
+) -> tuple[Any, Any, Outcome]:
+    """A step of a batch that draws a fresh start wherever an episode has ended.
+
+    Arguments are those of `step_and_renew`.
+
+    Returns:
+        (carried, reached, outcome): `carried` are the states to go on from, newly drawn after an
+        end; `reached` are the states the step led to, terminal ones included.
+    """
+    carried, reached, outcome = step_and_renew(env, keys, states, actions, params, lambda _: ())
+    return carried[0], reached[0], outcome

@@ -38,7 +38,6 @@ SCALE: tuple[float, ...] = (1.0, 1.0, 1.0, 10.0) * (
 )  # of x, y, heading, speed, for learners
 UNSEEN = (-1.5, -1.51)  # where the observation puts obstacles that do not exist
 FIDELITIES = ("released", "paper")
-MOST_OBSTACLES = 400  # of radius .1: more leave no free place in the room
 
 
 class State(struct.PyTreeNode):
@@ -116,9 +115,10 @@ def make_params(
         ValueError: a value is out of range.
     """
     one_of("fidelity", fidelity, FIDELITIES)
-    number("num_obstacles", num_obstacles, least=1, most=MOST_OBSTACLES, integer=True)
     positive("time_limit", time_limit, integer=True)
     positive("radius", radius, most=0.2)
+    room = int((ROOM / (2 * radius)) ** 2)  # how many fit, side by side
+    number("num_obstacles", num_obstacles, least=1, most=room, integer=True)
     positive("beta", beta, most=1.0)
     positive("wall_horizon", wall_horizon, integer=True)
     positive("obstacle_horizon", obstacle_horizon, integer=True)
@@ -194,7 +194,8 @@ def _appear(key: Array, agent: Vehicle, needed: Array, params: Params) -> Vehicl
     def attempt(carry):
         count, left, placed = carry
         place = _anywhere(jax.random.fold_in(key, count), params)
-        free = squared_distance(place.position, agent.position) >= CLEARANCE**2
+        # Written so that an agent at nan ends the search instead of prolonging it for ever.
+        free = ~(squared_distance(place.position, agent.position) < CLEARANCE**2)
         now = (jnp.arange(len(left)) == jnp.argmax(left)) & free
         placed = jax.vmap(base.select, (0, None, 0))(now, place, placed)
         return count + 1, left & ~now, placed
@@ -288,18 +289,15 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
 
 def _seen_obstacles(state: State) -> Array:
     """(8, 4) the nearest obstacles by distance: x, y, heading in the agent's frame, speed."""
-    agent, others = state.agent, state.obstacles
-    missing = max(0, SEEN_OBSTACLES - others.speed.shape[0])
-    offset = others.position - agent.position[None]
-    unseen = jnp.asarray(UNSEEN, offset.dtype)
-    offset = jnp.where(state.present[:, None], offset, unseen[None])
-    facing = jnp.where(state.present[:, None], others.heading, -agent.heading[None])
-    speed = jnp.where(state.present, others.speed, agent.speed)
+    agent = state.agent
+    missing = max(0, SEEN_OBSTACLES - state.present.shape[0])
+    pad = lambda a: jnp.pad(a, ((0, missing),) + ((0, 0),) * (a.ndim - 1))  # noqa: E731
+    others, present = jax.tree.map(pad, (state.obstacles, state.present))
     # Obstacles that do not exist stand at UNSEEN (world frame), facing the agent's back.
-    pad = ((0, missing), (0, 0))
-    offset = jnp.pad(offset, pad).at[len(speed) :].set(unseen)
-    facing = jnp.pad(facing, pad).at[len(speed) :].set(-agent.heading)
-    speed = jnp.pad(speed, pad[0]).at[len(others.speed) :].set(agent.speed)
+    offset = others.position - agent.position[None]
+    offset = jnp.where(present[:, None], offset, jnp.asarray(UNSEEN, offset.dtype)[None])
+    facing = jnp.where(present[:, None], others.heading, -agent.heading[None])
+    speed = jnp.where(present, others.speed, agent.speed)
     local = to_ego(offset, agent.heading)
     turn = angle_of(to_ego(facing, agent.heading))
     rows = jnp.concatenate([local, turn[:, None], speed[:, None]], axis=-1)

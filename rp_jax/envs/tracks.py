@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from scipy.spatial import cKDTree
 
 from rp_jax import sensing
 
@@ -143,6 +144,13 @@ def make_track(plan: TrackPlan, radius: float, reach: float) -> Track:
     # Theorem 3's bound, and makes it tighter.
     _, first = np.unique(walls.round(9), axis=0, return_index=True)
     walls = walls[np.sort(first)]
+    room = cKDTree(walls).query(centre)[0]
+    if room.min() <= radius:
+        i = int(room.argmin())
+        raise ValueError(
+            f"track: at centre point {i} {centre[i].round(2)} a wall is {room[i]:.3f} away; it "
+            f"must be farther than the vehicle's radius, {radius} (is a curve too tight?)"
+        )
     onward = np.roll(centre, -1, axis=0) - centre
     return Track(
         centre=jnp.asarray(centre, float),

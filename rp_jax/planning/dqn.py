@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 import optax
@@ -36,7 +37,6 @@ class DQNConfig:
     polyak: float = 0.01  # 0: copy every `period`
     period: int = 1000  # updates between copies
     reward_scale: float = 0.1
-    total_updates: int = 10_000  # over which the learning rate falls
 
     def validate(self, name: str) -> None:
         """Raises ValueError, naming the field after `name`, if a value is out of range."""
@@ -69,31 +69,40 @@ def double_q_target(
         target: (A,) Q'(s', .) that values.
         admissible: (A,) bool; greedy-eta alone where s' is not secure.
     """
+    chex.assert_rank([reward, discount, online, target, admissible], [0, 0, 1, 1, 1])
     return reward + discount * target[shield.masked_argmax(online, admissible)]
 
 
-def optimiser(config: DQNConfig) -> optax.GradientTransformation:
-    """Adam."""
+def optimiser(config: DQNConfig, updates: int) -> optax.GradientTransformation:
+    """Adam, whose rate may fall over so many updates."""
     rate = config.learning_rate
-    schedule = optax.cosine_decay_schedule(rate, config.total_updates, alpha=0.1)
+    schedule = optax.cosine_decay_schedule(rate, updates, alpha=0.1)
     return optax.adam(schedule if config.anneal else rate, eps=config.epsilon)
 
 
-def init(key: Array, network: nn.Module, encoded: Encoded, config: DQNConfig) -> Learner:
+def init(
+    key: Array, network: nn.Module, transform: optax.GradientTransformation, encoded: Encoded
+) -> Learner:
     """A fresh learner; `encoded` is any example."""
     params = network.init(key, encoded)
     target = jax.tree.map(jnp.copy, params)
-    return Learner(params, target, optimiser(config).init(params), jnp.asarray(0, jnp.int32))
+    return Learner(params, target, transform.init(params), jnp.asarray(0, jnp.int32))
 
 
 def update(
-    learner: Learner, network: Any, batch: Transition, weights: Array, config: DQNConfig
+    learner: Learner,
+    network: nn.Module,
+    transform: optax.GradientTransformation,
+    batch: Transition,
+    weights: Array,
+    config: DQNConfig,
 ) -> tuple[Learner, Array, Array]:
     """One gradient step.
 
     Args:
         learner: before the step.
-        network: maps (params, Encoded) to action values.
+        network: of the action values.
+        transform: from `optimiser`.
         batch: transitions with leading axis (B,).
         weights: (B,) of the samples, 1 unless the replay is prioritised.
         config: hyperparameters.
@@ -101,19 +110,19 @@ def update(
     Returns:
         (learner, loss, errors): the mean Huber loss and the temporal-difference errors (B,).
     """
-    online = network.apply(learner.params, batch.next_encoded)
-    target = network.apply(learner.target, batch.next_encoded)
+    online = jnp.asarray(network.apply(learner.params, batch.next_encoded))
+    target = jnp.asarray(network.apply(learner.target, batch.next_encoded))
     admissible = jax.vmap(shield.from_bits, (0, None))(batch.next_admissible, online.shape[-1])
     reward = batch.reward * config.reward_scale
     goal = jax.vmap(double_q_target)(reward, batch.discount, online, target, admissible)
 
     def loss(params):
-        values = network.apply(params, batch.encoded)
+        values = jnp.asarray(network.apply(params, batch.encoded))
         chosen = jnp.take_along_axis(values, batch.action[:, None], axis=-1)[:, 0]
         return jnp.mean(weights * optax.huber_loss(chosen, goal)), chosen - goal
 
     (value, errors), grads = jax.value_and_grad(loss, has_aux=True)(learner.params)
-    updates, opt_state = optimiser(config).update(grads, learner.opt_state, learner.params)
+    updates, opt_state = transform.update(grads, learner.opt_state, learner.params)
     params = optax.apply_updates(learner.params, updates)
     count = learner.updates + 1
     if config.polyak > 0:

@@ -1,11 +1,13 @@
 """The training loop: acting, threat, replay and learning in one jitted chunk."""
 
+import functools
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import flashbax
 import jax
 import jax.numpy as jnp
+import optax
 from flax import linen as nn
 from jax import Array
 
@@ -14,6 +16,7 @@ from rp_jax.envs import base
 from rp_jax.planning import dqn
 from rp_jax.planning.dqn import DQNConfig, Learner, Transition
 from rp_jax.planning.networks import NETWORKS
+from rp_jax.planning.nstep import Taken, n_step_transition
 from rp_jax.planning.pmdp import PMDP, Encoded
 from rp_jax.validate import number, one_of
 
@@ -48,7 +51,8 @@ class LoopConfig:
         number(f"{name}.updates", self.updates, least=1, integer=True)
         number(f"{name}.n_step", self.n_step, least=1, most=100, integer=True)
         number(f"{name}.replay", self.replay, least=max(self.batch, self.num_envs), integer=True)
-        number(f"{name}.replay_start", self.replay_start, least=1, most=self.replay, integer=True)
+        most = self.replay // self.num_envs * self.num_envs
+        number(f"{name}.replay_start", self.replay_start, least=1, most=most, integer=True)
         number(f"{name}.priority_exponent", self.priority_exponent, least=0, most=1)
         number(f"{name}.importance", self.importance, least=0, most=1)
         number(f"{name}.explore_from", self.explore_from, least=0, most=1)
@@ -66,18 +70,6 @@ class LoopConfig:
         return self.batch * self.updates / self.num_envs
 
 
-class Taken(NamedTuple):
-    """One step of every environment, as the n-step window keeps it."""
-
-    encoded: Encoded
-    action: Array  # (B,)
-    reward: Array  # (B,) penalty included
-    terminated: Array  # (B,)
-    done: Array  # (B,)
-    next_encoded: Encoded
-    next_admissible: Array  # (B,) bits
-
-
 class Metrics(NamedTuple):
     """Sums over a chunk of iterations; divide by `episodes` or `steps`."""
 
@@ -91,13 +83,19 @@ class Metrics(NamedTuple):
     loss: Array
 
 
+class Seen(NamedTuple):
+    """What is kept of looking at a batch of states."""
+
+    encoded: Encoded  # (B,)
+    threat: Array  # (B, A)
+    bits: Array  # (B,) int32, admissible actions
+
+
 class LoopState(NamedTuple):
     """Carried through training."""
 
     states: Any  # (B,) environment states
-    encoded: Encoded  # (B,) of those states
-    threat: Array  # (B, A)
-    bits: Array  # (B,) admissible actions
+    seen: Seen  # of those states
     score: Array  # (B,) reward of the running episodes
     window: Taken  # (n_step, B), oldest first
     learner: Learner
@@ -112,6 +110,11 @@ def make_network(config: LoopConfig, pmdp: PMDP) -> nn.Module:
     return NETWORKS[config.network](num_actions=num_actions, scale=pmdp.env.SCALE)
 
 
+def make_optimiser(config: LoopConfig) -> optax.GradientTransformation:
+    """Adam over the whole run."""
+    return dqn.optimiser(config.learner, config.iterations * config.updates)
+
+
 def make_replay(config: LoopConfig) -> Any:
     """A flashbax buffer of single transitions, uniform or prioritised."""
     sizes = {
@@ -124,26 +127,6 @@ def make_replay(config: LoopConfig) -> Any:
         exponent = config.priority_exponent
         return flashbax.make_prioritised_item_buffer(priority_exponent=exponent, **sizes)
     return flashbax.make_item_buffer(**sizes)
-
-
-def n_step_transition(window: Taken, gamma: float) -> Transition:
-    """The transition from the window's first step to its last, or to the first end in it.
-
-    `window` is of a single environment: leading axis (n,).
-    """
-    n = window.reward.shape[0]
-    before = jnp.cumsum(window.done) - window.done == 0  # no end before this step
-    last = jnp.sum(before) - 1
-    powers = gamma ** jnp.arange(n)
-    at = lambda tree, i: jax.tree.map(lambda a: a[i], tree)  # noqa: E731
-    return Transition(
-        encoded=at(window.encoded, 0),
-        action=window.action[0],
-        reward=jnp.sum(jnp.where(before, powers * window.reward, 0.0)),
-        discount=jnp.where(window.terminated[last], 0.0, gamma * powers[last]),
-        next_encoded=at(window.next_encoded, last),
-        next_admissible=window.next_admissible[last],
-    )
 
 
 def exploration(iteration: Array, config: LoopConfig) -> Array:
@@ -163,43 +146,39 @@ def _choose(key: Array, values: Array, bits: Array, epsilon: Array) -> Array:
     return action.astype(jnp.int32)
 
 
-def _look(pmdp: PMDP, states: Any) -> tuple[Encoded, Array, Array]:
-    """(encoded, threat, bits) of a batch of states."""
+def _look(pmdp: PMDP, states: Any) -> Seen:
     percept = pmdp.perceive(states)
-    return percept.encoded, percept.threat, jax.vmap(shield.to_bits)(percept.admissible)
+    bits = jax.vmap(shield.to_bits)(percept.admissible)
+    return Seen(encoded=percept.encoded, threat=percept.threat, bits=bits)
 
 
 def interact(
     key: Array, state: LoopState, pmdp: PMDP, network: nn.Module, config: LoopConfig
 ) -> tuple[LoopState, Metrics]:
     """Every environment takes one step; the window moves on; nothing is learned."""
-    choose_key, step_key, reset_key = jax.random.split(key, 3)
+    choose_key, step_key = jax.random.split(key)
     batch = config.num_envs
-    values = jnp.asarray(network.apply(state.learner.params, state.encoded))
+    values = jnp.asarray(network.apply(state.learner.params, state.seen.encoded))
     epsilon = exploration(state.iteration, config)
     keys = jax.random.split(choose_key, batch)
-    action = jax.vmap(_choose, (0, 0, 0, None))(keys, values, state.bits, epsilon)
-    step = jax.vmap(pmdp.env.step, (0, 0, 0, None))
-    reached, outcome = step(jax.random.split(step_key, batch), state.states, action, pmdp.params)
-    encoded, threat, bits = _look(pmdp, reached)
+    action = jax.vmap(_choose, (0, 0, 0, None))(keys, values, state.seen.bits, epsilon)
+    carried, (_, seen), outcome = base.step_and_renew(
+        pmdp.env,
+        jax.random.split(step_key, batch),
+        state.states,
+        action,
+        pmdp.params,
+        functools.partial(_look, pmdp),
+    )
     taken = Taken(
-        encoded=state.encoded,
+        encoded=state.seen.encoded,
         action=action,
         reward=outcome.reward - pmdp.penalty * outcome.danger,
         terminated=outcome.terminated,
         done=outcome.done,
-        next_encoded=encoded,
-        next_admissible=bits,
+        next_encoded=seen.encoded,
+        next_admissible=seen.bits,
     )
-    # Fresh starts, and looking at them, only where an episode has ended.
-    reset_keys = jax.random.split(reset_key, batch)
-
-    def starts(rows: Array):
-        fresh_keys = reset_keys.at[rows].get(mode="clip")
-        fresh = jax.vmap(pmdp.env.reset, (0, None))(fresh_keys, pmdp.params)
-        return fresh, *_look(pmdp, fresh)
-
-    carried = base.renew(outcome.done, (reached, encoded, threat, bits), starts)
     score = state.score + outcome.reward
     metrics = Metrics(
         steps=jnp.asarray(batch, score.dtype),
@@ -207,8 +186,8 @@ def interact(
         score=jnp.sum(jnp.where(outcome.done, score, 0.0)),
         crashes=jnp.sum(outcome.danger),
         goals=jnp.sum(outcome.goal, dtype=score.dtype),
-        insecure=jnp.sum(jnp.min(state.threat, axis=-1) > pmdp.x, dtype=score.dtype),
-        inadmissible=jnp.sum(_inadmissible(state.threat, action, pmdp.x), dtype=score.dtype),
+        insecure=jnp.sum(jnp.min(state.seen.threat, axis=-1) > pmdp.x, dtype=score.dtype),
+        inadmissible=jnp.sum(_inadmissible(state.seen.threat, action, pmdp.x), dtype=score.dtype),
         loss=jnp.zeros((), score.dtype),
     )
     window = jax.tree.map(
@@ -216,9 +195,7 @@ def interact(
     )
     state = state._replace(
         states=carried[0],
-        encoded=carried[1],
-        threat=carried[2],
-        bits=carried[3],
+        seen=carried[1],
         score=jnp.where(outcome.done, 0.0, score),
         window=window,
     )
@@ -239,7 +216,8 @@ def init(key: Array, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics
     network, replay = make_network(config, pmdp), make_replay(config)
     resets = jax.random.split(reset_key, batch)
     states = jax.vmap(pmdp.env.reset, (0, None))(resets, pmdp.params)
-    encoded, threat, bits = _look(pmdp, states)
+    seen = _look(pmdp, states)
+    encoded, threat, bits = seen
     zeros = jnp.zeros(batch, threat.dtype)
     false = jnp.zeros(batch, bool)
     taken = Taken(encoded, jnp.zeros(batch, jnp.int32), zeros, false, false, encoded, bits)
@@ -247,12 +225,10 @@ def init(key: Array, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics
     example = _oldest(window, config)
     state = LoopState(
         states=states,
-        encoded=encoded,
-        threat=threat,
-        bits=bits,
+        seen=seen,
         score=zeros,
         window=window,
-        learner=dqn.init(net_key, network, encoded, config.learner),
+        learner=dqn.init(net_key, network, make_optimiser(config), encoded),
         replay=replay.init(jax.tree.map(lambda a: a[0], example)),
         key=key,
         iteration=jnp.asarray(0, jnp.int32),
@@ -302,7 +278,7 @@ def learn(key: Array, state: LoopState, pmdp: PMDP, config: LoopConfig) -> tuple
         weights = (sample.probabilities + 1e-12) ** -power
         weights = weights / jnp.max(weights)
     learner, loss, errors = dqn.update(
-        state.learner, network, sample.experience, weights, config.learner
+        state.learner, network, make_optimiser(config), sample.experience, weights, config.learner
     )
     stored = state.replay
     if config.prioritised:

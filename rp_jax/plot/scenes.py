@@ -8,7 +8,7 @@ import matplotlib
 import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.colors import LogNorm
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle, Rectangle, Wedge
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -20,7 +20,9 @@ class Scene(NamedTuple):
     """What stands still: drawn under everything else."""
 
     walls: np.ndarray  # (w, 2)
-    zones: Sequence[tuple[float, float, float, float]] = ()  # x, y, width, height
+    corners: Sequence[tuple[float, float]] = ()  # of the room, with safety zones
+    zone: float = 0.0  # side of the zones' squares, or their radius
+    round_zones: bool = False
     radius: float = 0.1  # of the vehicles
 
 
@@ -40,8 +42,15 @@ class Episode(NamedTuple):
 
 def draw_scene(axis: Any, scene: Scene) -> None:
     """Walls as dots, safety zones shaded."""
-    for x, y, width, height in scene.zones:
-        axis.add_patch(Rectangle((x, y), width, height, color=ZONE, zorder=0))
+    low, high = scene.walls.min(axis=0), scene.walls.max(axis=0)
+    for corner in scene.corners:
+        if scene.round_zones:
+            inner = np.where(np.asarray(corner) == low, 0, 90)
+            start = {(0, 0): 0, (90, 0): 90, (90, 90): 180, (0, 90): 270}[tuple(inner)]
+            axis.add_patch(Wedge(corner, scene.zone, start, start + 90, color=ZONE, zorder=0))
+        else:
+            place = np.minimum(corner, high - scene.zone)
+            axis.add_patch(Rectangle(place, scene.zone, scene.zone, color=ZONE, zorder=0))
     axis.plot(*scene.walls.T, ".", color="#2d3748", markersize=1.5, zorder=1)
     axis.set_aspect("equal")
     axis.set_xticks([])

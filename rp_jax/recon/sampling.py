@@ -3,6 +3,7 @@
 A start is drawn as features, from which the hazard source restores the states.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -10,7 +11,6 @@ import jax.numpy as jnp
 from jax import Array
 
 from rp_jax.hazards import SubRMDP
-from rp_jax.threat.model import ThreatModel
 
 
 def uniform(key: Array, sub: SubRMDP, count: int) -> Array:
@@ -35,7 +35,7 @@ def interest(threat: Array, x: Any) -> Array:
 def preferential(
     key: Array,
     sub: SubRMDP,
-    model: ThreatModel,
+    model: Callable[[Array], Array],
     features: Array,
     threat: Array,
     x: Any,
@@ -52,7 +52,7 @@ def preferential(
     Args:
         key: of the draw.
         sub: the sub-R-MDP.
-        model: fitted to the labels so far.
+        model: maps features (..., F) to threats (..., A); fitted to the labels so far.
         features: (n, F) of the states labelled so far.
         threat: (n, A) their labels.
         x: the threshold that matters.
@@ -64,12 +64,14 @@ def preferential(
     half = count * pool // 2
     spread = uniform(spread_key, sub, count * pool - half)
     error = jnp.mean(jnp.abs(model(features) - threat), axis=-1)
-    # Gumbel noise draws without replacement, in proportion to the weights.
     rows = jax.random.choice(pick_key, len(features), (half,), p=error / jnp.sum(error))
     fresh = uniform(shift_key, sub, half)
     # A step of a twentieth towards a uniform draw stays inside the window.
     near = features[rows] + 0.05 * (fresh - features[rows])
+    # Features that no state has (a heading that is not of unit length) are brought back.
+    near = jax.vmap(lambda f: sub.source.features(*sub.source.state_of(f)))(near)
     candidates = jnp.concatenate([spread, near])
     weight = floor + interest(model(candidates), x)
+    # Gumbel noise draws without replacement, in proportion to the weights.
     noise = jax.random.gumbel(thin_key, (len(candidates),))
     return candidates[jnp.argsort(-(jnp.log(weight) + noise))[:count]]

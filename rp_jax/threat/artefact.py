@@ -85,7 +85,7 @@ def _blank(folder: Path, kind: str, facts: Any, sub: SubRMDP) -> ThreatModel:
             f"{folder}: {kind}: hidden is {hidden!r}; it must list up to 16 widths of at most "
             f"{WIDEST}"
         )
-    if facts.get("activation") not in ACTIVATIONS:
+    if facts.get("activation") not in list(ACTIVATIONS):
         raise storage.StorageError(
             f"{folder}: {kind}: activation is {facts.get('activation')!r}; it must be one of "
             f"{sorted(ACTIVATIONS)}"

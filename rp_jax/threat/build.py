@@ -128,7 +128,7 @@ def build(
             and prudence look closely.
         on_progress: told how far each stage is.
     """
-    keys = jax.random.split(key, 8)
+    keys = jax.random.split(key, 9)
     estimator = labels.best_estimator(sub, config.paths)
     accurate = labels.best_estimator(sub, config.test_paths)
     began = time.perf_counter()
@@ -147,14 +147,15 @@ def build(
     labelled = time.perf_counter()
     model, curve = fitted(keys[5], sub, data, config.fit, on_progress)
     if config.prudence < 1:
-        pool = sampling.uniform(keys[6], sub, 20 * config.test_states)
+        pool = sampling.uniform(keys[8], sub, 20 * config.test_states)
         order = jnp.argsort(-sampling.interest(model(pool), x))
         hard = pool[order[: config.test_states]]
         checked = _labelled(keys[6], hard, sub, accurate, "prudence", on_progress)
         model = prudent(model, checked, x, config.prudence)
     fitted_at = time.perf_counter()
-    fresh = sampling.uniform(jax.random.fold_in(keys[7], 0), sub, config.test_states)
-    test = _labelled(keys[7], fresh, sub, accurate, "report", on_progress)
+    fresh_key, test_key = jax.random.split(keys[7])
+    fresh = sampling.uniform(fresh_key, sub, config.test_states)
+    test = _labelled(test_key, fresh, sub, accurate, "report", on_progress)
     found = report.compare(np.asarray(report.predict(model, fresh)), np.asarray(test.threat), x)
     seconds = {
         "labels": labelled - began,

@@ -60,7 +60,7 @@ def _summed(model: ThreatModel, agents: Any, hazards: Hazards) -> Array:
     count = rank[-1]
     slot = jnp.where(flat, rank - 1, size)
     origin = jnp.arange(batch * n, dtype=jnp.int32)
-    source = jnp.zeros(size, jnp.int32).at[slot].set(origin, mode="drop", unique_indices=True)
+    source = jnp.zeros(size, jnp.int32).at[slot].set(origin, mode="drop")
     rows = features.reshape(batch * n, -1)
 
     def add_chunk(carry):
