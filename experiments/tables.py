@@ -29,7 +29,7 @@ COLUMNS = [
     "seconds_per_100_actions",
     "train_seconds",
 ]
-ABREAST = 4  # cases that fit a terminal side by side
+ABREAST = 3  # cases that fit a terminal side by side
 
 
 def write(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -5,6 +5,10 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from rp_jax.recon.labels import exact_threat, monte_carlo_threat
+
+PATHS = 4096
+
 jax.config.update("jax_numpy_rank_promotion", "raise")
 settings.register_profile("rp_jax", deadline=None, derandomize=True, database=None, max_examples=50)
 settings.load_profile("rp_jax")
@@ -29,3 +33,38 @@ def precision(request):
     """Runs a test in both precisions; build all parameters inside it."""
     with jax.enable_x64(request.param == "float64"):
         yield request.param
+
+
+def of_any_speeds(sub):
+    """Only the ends of the speeds matter to a label: one compilation serves all vehicles."""
+    ends = sub.agent.speeds[np.asarray([0, -1])]
+    return sub.replace(agent=sub.agent.replace(speeds=ends))
+
+
+@pytest.fixture(scope="session")
+def exact():
+    """(features (n, F), sub) -> Labels (n, A), by enumeration."""
+
+    @jax.jit
+    def label(features, sub):
+        def one(row):
+            return exact_threat(jax.random.key(0), *sub.source.state_of(row), sub)
+
+        return jax.lax.map(one, features, batch_size=50)
+
+    return lambda features, sub: label(features, of_any_speeds(sub))
+
+
+@pytest.fixture(scope="session")
+def monte_carlo():
+    """(key, features (n, F), sub) -> Labels (n, A), from 4,096 paths each."""
+
+    @jax.jit
+    def label(key, features, sub):
+        def one(row):
+            key, features = row
+            return monte_carlo_threat(key, *sub.source.state_of(features), sub, PATHS)
+
+        return jax.lax.map(one, (jax.random.split(key, len(features)), features))
+
+    return lambda key, features, sub: label(key, features, of_any_speeds(sub))

@@ -128,7 +128,7 @@ def test_mirrored_actions_keep_the_acceleration_and_swap_the_turn():
 
 
 def test_mirrored_actions_are_refused_where_an_action_has_no_mirror_image():
-    with pytest.raises(ValueError, match="actions.*mirror"):
+    with pytest.raises(ValueError, match=r"actions.*mirror"):
         mirrored_actions(control_table((0.0,), (-0.3, 0.0, 0.1)))
 
 

@@ -103,7 +103,7 @@ def test_equal_values_have_an_interval_of_width_zero():
 
 
 def test_the_mean_of_no_values_and_bad_confidences_are_refused():
-    with pytest.raises(ValueError, match="^number of values is 0; it must be .*at least 1"):
+    with pytest.raises(ValueError, match=r"^number of values is 0; it must be .*at least 1"):
         mean_interval([])
-    with pytest.raises(ValueError, match="^confidence is 1.5"):
+    with pytest.raises(ValueError, match=r"^confidence is 1\.5"):
         mean_interval([1.0, 2.0], 1.5)

@@ -58,7 +58,9 @@ def test_number_returns_a_value_within_the_rules(value, rules):
     ],
 )
 def test_number_names_the_field_the_value_and_what_is_allowed(value, rules, allowed):
-    with pytest.raises(ValueError, match=f"^speed is {re.escape(repr(value))}; it must be {allowed}$"):
+    with pytest.raises(
+        ValueError, match=f"^speed is {re.escape(repr(value))}; it must be {allowed}$"
+    ):
         number("speed", value, **rules)
 
 
@@ -68,19 +70,19 @@ def test_number_accepts_exactly_the_finite_values_of_the_interval(value, least, 
     if good:
         assert number("n", value, least=least, most=most) == value
     else:
-        with pytest.raises(ValueError, match="^n is"):
+        with pytest.raises(ValueError, match=r"^n is"):
             number("n", value, least=least, most=most)
 
 
 @pytest.mark.parametrize("value", [0, -1.0, float("inf"), float("nan"), "1"])
 def test_positive_refuses_what_is_not_above_zero_and_finite(value):
-    with pytest.raises(ValueError, match="^width is .*; it must be a finite number, above 0$"):
+    with pytest.raises(ValueError, match=r"^width is .*; it must be a finite number, above 0$"):
         positive("width", value)
 
 
 def test_positive_checks_the_upper_end_and_whole_numbers():
     assert positive("n", 3, most=3, integer=True) == 3
-    with pytest.raises(ValueError, match="^n is 4; it must be an integer, above 0, at most 3$"):
+    with pytest.raises(ValueError, match=r"^n is 4; it must be an integer, above 0, at most 3$"):
         positive("n", 4, most=3, integer=True)
     with pytest.raises(ValueError, match=r"^n is 2\.5; it must be an integer"):
         positive("n", 2.5, integer=True)

@@ -92,7 +92,9 @@ def same_angles(actual, expected, tolerance):
     """Compares angles near +-pi modulo 2 pi, and returns how many those are."""
     actual = np.asarray(actual, np.float64)
     half_turn = np.pi - np.abs(expected) <= tolerance
-    same(np.where(half_turn, np.abs(actual), actual), np.where(half_turn, np.pi, expected), tolerance)
+    same(
+        np.where(half_turn, np.abs(actual), actual), np.where(half_turn, np.pi, expected), tolerance
+    )
     return int(half_turn.sum())
 
 

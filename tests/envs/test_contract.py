@@ -1,0 +1,347 @@
+"""What holds of every environment: add yours to ENVS."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from rp_jax.envs import base, circuit, jam
+from rp_jax.hazards import SubRMDP
+
+ENVS = {
+    "circuit": (circuit, lambda: circuit.make_params()),
+    "circuit-paper": (circuit, lambda: circuit.make_params("circle", fidelity="paper")),
+    "jam-8": (jam, lambda: jam.make_params(8)),
+    "jam-3-paper": (jam, lambda: jam.make_params(3, fidelity="paper")),
+}
+LIMIT, STEPS, ROWS = 25, 300, 7
+FUNCTIONS = ["reset", "step", "observe", "hazards", "causes", "sub_rmdps", "num_actions"]
+# One of each module, for tests that are long and to which the variant does not matter.
+EACH_MODULE = {env: name for name, (env, _) in reversed(ENVS.items())}
+every_env = pytest.mark.parametrize("name", ENVS)
+every_module = pytest.mark.parametrize("name", EACH_MODULE.values())
+
+
+@functools.lru_cache
+def made(name):
+    env, make = ENVS[name]
+    return env, make().replace(time_limit=jnp.asarray(LIMIT, jnp.int32))
+
+
+def play(env, row_keys, params):
+    """Every row plays at random; returns what each step had and led to, axes (steps, rows)."""
+    actions = env.num_actions(params)
+
+    def step(states, t):
+        keys = jax.vmap(jax.random.fold_in, (0, None))(row_keys, t)
+        pick = lambda key: jax.random.randint(jax.random.fold_in(key, 1), (), 0, actions)  # noqa: E731
+        action = jax.vmap(pick)(keys)
+        carried, reached, outcome = base.auto_reset_step(env, keys, states, action, params)
+        look = lambda f: jax.vmap(f, (0, None))(reached, params)  # noqa: E731
+        seen = {name: look(getattr(env, name)) for name in ("observe", "causes", "hazards")}
+        data = jax.random.key_data(keys)  # typed keys are no arrays to numpy
+        seen |= {"keys": data, "before": states, "action": action}
+        return carried, seen | {"reached": reached, "outcome": outcome, "carried": carried}
+
+    starts = jax.vmap(env.reset, (0, None))(row_keys, params)
+    return jax.lax.scan(step, starts, jnp.arange(STEPS))[1]
+
+
+jitted_play = jax.jit(play, static_argnums=0)
+
+
+def keys_of(seed):
+    return jax.random.split(jax.random.key(seed), ROWS)
+
+
+@functools.lru_cache
+def played(name):
+    return replay(name, keys_of(0))
+
+
+def replay(name, row_keys):
+    env, params = made(name)
+    return jax.device_get(jitted_play(env, row_keys, params))
+
+
+@functools.lru_cache
+def stepper(name):
+    """A jitted, vmapped step, and a list that grows whenever it is traced."""
+    env, traced = made(name)[0], []
+
+    def step(key, state, action, params):
+        traced.append(name)
+        return env.step(key, state, action, params)
+
+    return jax.jit(jax.vmap(step, (0, 0, 0, None))), traced
+
+
+def same_bits(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def row(tree, *index):
+    return jax.tree.map(lambda a: a[index], tree)
+
+
+def described(tree):
+    return jax.tree.structure(tree), [(a.shape, a.dtype) for a in jax.tree.leaves(tree)]
+
+
+@every_env
+def test_an_environment_has_every_function_of_the_contract(name):
+    env, params = made(name)
+    assert all(callable(getattr(env, function)) for function in FUNCTIONS)
+    assert isinstance(env.num_actions(params), int)
+    assert env.num_actions(params) > 1
+    subs = env.sub_rmdps(params)
+    assert all(isinstance(sub, SubRMDP) for sub in subs.values())
+    state = jax.eval_shape(env.reset, jax.random.key(0), params)
+    assert set(jax.eval_shape(env.hazards, state, params)) == set(subs)
+    assert set(jax.eval_shape(env.causes, state, params)) == set(subs)
+
+
+@every_env
+def test_a_step_keeps_structure_shapes_and_types_of_the_state(name):
+    env, params = made(name)
+    key, action = jax.random.key(0), jnp.asarray(0)
+    state = jax.eval_shape(env.reset, key, params)
+    reached, outcome = jax.eval_shape(env.step, key, state, action, params)
+    assert described(reached) == described(state)
+    assert state.time.shape == ()
+    assert state.time.dtype == jnp.int32
+    assert {a.shape for a in jax.tree.leaves(outcome)} == {()}
+    assert outcome.reward.dtype == outcome.danger.dtype == jnp.float32
+    for field in (outcome.terminated, outcome.truncated, outcome.goal):
+        assert field.dtype == bool
+    again = jax.eval_shape(env.step, key, reached, action, params)[0]
+    assert described(again) == described(state)
+
+
+@every_env
+def test_everything_is_double_when_double_precision_is_on(name, x64):
+    env, make = ENVS[name]
+    params = make()
+    state = jax.eval_shape(env.reset, jax.random.key(0), params)
+    reached, outcome = jax.eval_shape(env.step, jax.random.key(0), state, jnp.asarray(0), params)
+    floats = [a for a in jax.tree.leaves((reached, outcome)) if jnp.issubdtype(a.dtype, float)]
+    assert floats
+    assert {a.dtype for a in floats} == {jnp.dtype("float64")}
+    assert jax.eval_shape(env.observe, state, params).dtype == jnp.float64
+
+
+@every_env
+def test_observations_have_the_length_that_learners_are_told(name):
+    env, seen = made(name)[0], played(name)["observe"]
+    assert seen.shape == (STEPS, ROWS, env.LIDAR_BINS + len(env.SCALE))
+    assert seen.dtype == jnp.float32
+    assert (seen[..., : env.LIDAR_BINS] >= 0).all()
+
+
+@every_env
+def test_all_values_stay_finite_over_whole_episodes(name):
+    rows = played(name)
+    for part in ("reached", "carried", "outcome", "observe"):
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(rows[part]))
+
+
+@every_env
+def test_episodes_end_in_either_way_but_never_both(name):
+    outcome = played(name)["outcome"]
+    assert outcome.terminated.any()
+    assert outcome.truncated.any()
+    assert not (outcome.terminated & outcome.truncated).any()
+    np.testing.assert_array_equal(outcome.done, outcome.terminated | outcome.truncated)
+
+
+@every_env
+def test_the_time_limit_truncates_exactly_at_its_step(name):
+    rows = played(name)
+    outcome, time = rows["outcome"], rows["reached"].time
+    np.testing.assert_array_equal(time, rows["before"].time + 1)
+    np.testing.assert_array_equal(outcome.truncated, (time == LIMIT) & ~outcome.terminated)
+    assert time.max() == LIMIT
+
+
+@every_env
+def test_danger_is_one_exactly_where_some_hazard_is_hit_and_ends_the_episode(name):
+    rows = played(name)
+    outcome = rows["outcome"]
+    hit = functools.reduce(np.logical_or, rows["causes"].values())
+    assert hit.any()
+    np.testing.assert_array_equal(outcome.danger, hit)
+    assert (outcome.terminated | ~hit).all()
+    assert not (outcome.goal & hit).any()
+    assert (outcome.terminated | ~outcome.goal).all()
+
+
+@every_env
+def test_causes_are_hazards_that_are_present_and_hit(name):
+    env, params = made(name)
+    rows = played(name)
+    for kind, sub in env.sub_rmdps(params).items():
+        states, present = rows["hazards"][kind]
+        assert present.dtype == bool
+        over_hazards = jax.vmap(sub.source.hits, (None, 0))
+        hits = jax.jit(jax.vmap(jax.vmap(over_hazards)))(rows["reached"].agent, states)
+        np.testing.assert_array_equal(rows["causes"][kind], (hits & present).any(axis=-1))
+
+
+@every_env
+def test_equal_keys_play_equal_episodes_and_others_do_not(name):
+    rows = played(name)
+    same_bits(replay(name, keys_of(0)), rows)
+    other = replay(name, keys_of(1))
+    assert (other["observe"] != rows["observe"]).any()
+
+
+@every_module
+def test_no_row_of_a_batch_depends_on_the_others(name):
+    some = np.asarray([5, 0, 6])
+    fewer = replay(name, keys_of(0)[some])
+    same_bits(fewer, jax.tree.map(lambda a: a[:, some], played(name)))
+
+
+@every_env
+def test_a_step_can_start_from_any_state_and_has_no_memory(name):
+    env, params = made(name)
+    rows, (step, _) = played(name), stepper(name)
+    # States of 7 rows at 7 times, and their agents exchanged: situations nobody was in.
+    mixed = row(rows["before"], np.arange(3, 10) * 20, np.arange(7))
+    agents = row(rows["before"].agent, np.arange(9, 2, -1) * 25, np.arange(7))
+    times = np.asarray([0, 3, LIMIT - 2, LIMIT - 1, LIMIT, 99, 0], np.int32)
+    mixed = mixed.replace(agent=agents, time=times)
+    action = np.arange(7, dtype=np.int32) % env.num_actions(params)
+    reached, outcome = step(keys_of(2), mixed, action, params)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((reached, outcome)))
+    np.testing.assert_array_equal(reached.time, mixed.time + 1)
+    np.testing.assert_array_equal(outcome.done[3:6], [True] * 3)
+    # Whatever happened in between, the same state is left in the same way.
+    step(keys_of(3), row(rows["before"], 0), action, params)
+    same_bits(step(keys_of(2), mixed, action, params), (reached, outcome))
+
+
+@every_env
+def test_after_an_end_a_fresh_start_is_carried_and_otherwise_the_state_reached(name):
+    rows = played(name)
+    done, time = rows["outcome"].done, rows["carried"].time
+    assert (time[done] == 0).all()
+    assert (time[~done] > 0).all()
+    same_bits(row(rows["carried"], ~done), row(rows["reached"], ~done))
+    leaves = jax.tree.leaves(row(rows["carried"], done))
+    starts = np.concatenate([leaf.reshape(done.sum(), -1) for leaf in leaves], axis=1)
+    assert len(starts) > 20
+    assert len(np.unique(starts, axis=0)) > 0.9 * len(starts)  # drawn anew, not replayed
+    same_bits(row(rows["before"], slice(1, None)), row(rows["carried"], slice(None, -1)))
+
+
+@every_env
+def test_the_state_reached_is_that_of_the_step_even_where_it_is_terminal(name):
+    params, rows, (step, _) = made(name)[1], played(name), stepper(name)
+    terminated = rows["outcome"].terminated
+    t = int(np.argmax(terminated.sum(axis=1)))
+    assert terminated[t].any()
+    at = {part: row(rows[part], t) for part in ("keys", "before", "action", "reached", "outcome")}
+    keys = jax.vmap(jax.random.split)(jax.random.wrap_key_data(at["keys"]))[:, 0]
+    expected = step(keys, at["before"], at["action"], params)
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-5)
+    jax.tree.map(close, (at["reached"], at["outcome"]), expected)
+    assert (at["reached"].time[terminated[t]] > 0).all()
+
+
+@every_env
+def test_other_values_of_the_parameters_need_no_other_compilation(name):
+    params, rows, (step, traced) = made(name)[1], played(name), stepper(name)
+    args = keys_of(4), row(rows["before"], 10), np.zeros(ROWS, np.int32)
+    step(*args, params)
+    before = len(traced)
+    for limit in (3, 30):
+        _, outcome = step(*args, params.replace(time_limit=jnp.asarray(limit, jnp.int32)))
+        time = args[1].time + 1
+        np.testing.assert_array_equal(outcome.truncated, (time >= limit) & ~outcome.terminated)
+    step(*args, params.replace(beta=jnp.float32(0.5)))
+    assert len(traced) == before <= 1
+
+
+@every_module
+def test_parameters_can_be_swept_by_vmap(name):
+    env, params = made(name)
+    before, (step, _) = row(played(name)["before"], 10), stepper(name)
+    limits = jnp.asarray([2, 11, 1000], jnp.int32)
+    axes = jax.tree.map(lambda _: None, params).replace(time_limit=0)
+    sweep = jax.jit(jax.vmap(jax.vmap(env.step, (0, 0, 0, None)), (None, None, None, axes)))
+    args = keys_of(4), before, np.zeros(ROWS, np.int32)
+    _, outcome = sweep(*args, params.replace(time_limit=limits))
+    assert outcome.truncated.shape == (3, ROWS)
+    assert len(np.unique(outcome.truncated.sum(axis=1))) > 1
+    for i, limit in enumerate(limits):
+        _, expected = step(*args, params.replace(time_limit=limit))
+        np.testing.assert_array_equal(outcome.truncated[i], expected.truncated)
+        np.testing.assert_allclose(outcome.reward[i], expected.reward, atol=1e-5)
+
+
+@given(hnp.arrays(bool, 13), st.sampled_from([1, 4, 40]))
+def test_renew_makes_exactly_the_marked_rows(where, chunk):
+    rows = {"a": jnp.arange(13.0), "b": jnp.arange(26).reshape(13, 2)}
+    renewed = renew(jnp.asarray(where), rows, chunk)
+    new = make(jnp.arange(13))
+    expected = {
+        "a": jnp.where(where, new["a"], rows["a"]),
+        "b": jnp.where(where[:, None], new["b"], rows["b"]),
+    }
+    same_bits(renewed, expected)
+
+
+def make(indices):
+    return {"a": 100.0 + indices, "b": jnp.stack([-indices, indices * indices], axis=-1)}
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def renew(where, rows, chunk):
+    return base.renew(where, rows, make, chunk)
+
+
+@pytest.mark.parametrize("marked", [[], [0], [12], [1, 5, 7, 8, 12], list(range(13))])
+@pytest.mark.parametrize("chunk", [1, 4, 16])
+def test_renew_computes_no_row_that_is_not_marked(marked, chunk):
+    asked = []
+
+    def recorded(indices):
+        asked.append(np.asarray(indices).tolist())
+        return make(indices)
+
+    where = jnp.asarray([i in marked for i in range(13)])
+    rows = {"a": jnp.arange(13.0), "b": jnp.arange(26).reshape(13, 2)}
+    with jax.disable_jit():  # so that the loop runs in Python, and calls are seen
+        base.renew(where, rows, recorded, chunk)
+    assert len(asked) == -(-len(marked) // chunk)
+    assert all(len(indices) == chunk for indices in asked)
+    assert sorted(i for indices in asked for i in indices if i < 13) == marked
+
+
+def test_renew_keeps_the_rows_of_any_pytree_with_typed_keys():
+    keys = jax.random.split(jax.random.key(0), 5)
+    others = jax.random.split(jax.random.key(1), 5)
+    where = jnp.asarray([True, False, False, True, False])
+    renewed = base.renew(where, (keys,), lambda i: (others.at[i].get(mode="clip"),), 2)
+    expected = np.where(where[:, None], jax.random.key_data(others), jax.random.key_data(keys))
+    np.testing.assert_array_equal(jax.random.key_data(renewed[0]), expected)
+
+
+def test_the_time_limit_never_hides_a_true_end():
+    terminated, truncated = base.ended(
+        jnp.asarray([True, False, True, False]), jnp.asarray([5, 5, 4, 4]), jnp.asarray(5)
+    )
+    np.testing.assert_array_equal(terminated, [True, False, True, False])
+    np.testing.assert_array_equal(truncated, [False, True, False, False])
+
+
+def test_select_chooses_whole_pytrees():
+    yes, no = {"a": jnp.ones(3), "b": jnp.asarray(1)}, {"a": jnp.zeros(3), "b": jnp.asarray(0)}
+    same_bits(base.select(jnp.asarray(True), yes, no), yes)
+    same_bits(base.select(jnp.asarray(False), yes, no), no)

@@ -1,0 +1,445 @@
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from rp_jax.envs import jam
+from rp_jax.kinematics import Control, angle_of, make_vehicle
+from rp_jax.sensing import FAR
+
+COAST = 7  # neither acceleration nor turn
+AWAY = (1.5, 1.5)  # where no wall, zone or exit is near
+step = jax.jit(jax.vmap(jam.step, (0, 0, 0, None)))
+reset = jax.jit(jax.vmap(jam.reset, (0, None)))
+observe = jax.jit(jax.vmap(jam.observe, (0, None)))
+transition = jax.jit(jam.transition)
+causes = jax.jit(jam.causes)
+
+
+@functools.lru_cache
+def params_of(num_obstacles=8, fidelity="released"):
+    return jam.make_params(num_obstacles, fidelity=fidelity)
+
+
+def keys_of(seed, count):
+    return jax.random.split(jax.random.key(seed), count)
+
+
+def still(count):
+    return jnp.full(count, COAST)
+
+
+def at(positions, headings=0.0, speeds=0.0):
+    positions = np.asarray(positions, float)
+    full = lambda value: np.broadcast_to(np.asarray(value, float), positions.shape[:-1])  # noqa: E731
+    return make_vehicle(positions, full(headings), full(speeds))
+
+
+def settled(agent, places, fidelity="released"):
+    """The next state and outcome if the obstacles stand still at `places`.
+
+    There are always 17 of them, so that all tests share a compilation: the last place is
+    repeated. Whatever is relocated goes to (77, 77), where nothing else can be.
+    """
+    places = [*places, *[places[-1]] * (17 - len(places))]
+    params = params_of(17, fidelity)
+    straight = jnp.broadcast_to(jnp.asarray([1.0, 0.0]), (17, 2))
+    controls = Control(acceleration=jnp.zeros(17), rotation=straight)
+    draws = jam.Draws(controls=controls, relocated=at(np.full((17, 2), 77.0)))
+    state = jam.start_at(agent, at(places), params)
+    reached, outcome = transition(state, jnp.asarray(COAST), draws, params)
+    return reached, outcome, causes(reached, params)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def drive(row_keys, params, steps):
+    """States (steps + 1, rows) of agents that act at random and are never stopped."""
+
+    def move(states, t):
+        keys = jax.vmap(jax.random.fold_in, (0, None))(row_keys, t)
+        # They stay where obstacles are about: a turn to the left at half speed.
+        action = jnp.where(t < 3, 12, 9) * jnp.ones(len(row_keys), jnp.int32)
+        reached, _ = jax.vmap(jam.step, (0, 0, 0, None))(keys, states, action, params)
+        return reached, states
+
+    starts = jax.vmap(jam.reset, (0, None))(row_keys, params)
+    end, before = jax.lax.scan(move, starts, jnp.arange(steps))
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), before, end)
+
+
+@functools.lru_cache
+def driven(num_obstacles):
+    return jax.device_get(drive(keys_of(0, 32), params_of(num_obstacles), 80))
+
+
+def jumps(states):
+    """(steps, rows, N) whether an obstacle was relocated: none drives .061 in a step."""
+    place = states.obstacles.position
+    return np.linalg.norm(place[1:] - place[:-1], axis=-1) > 0.061
+
+
+def test_an_obstacle_moves_alike_to_the_bit_among_however_many():
+    few, many = driven(3), driven(15)
+    single = driven(1)
+    assert jumps(single).sum() > 20
+    first = lambda n, states: jax.tree.map(lambda a: a[:, :, :n], states.obstacles)  # noqa: E731
+    jax.tree.map(np.testing.assert_array_equal, first(1, few), first(1, single))
+    jax.tree.map(np.testing.assert_array_equal, first(1, many), first(1, single))
+    jax.tree.map(np.testing.assert_array_equal, first(3, many), first(3, few))
+    jax.tree.map(np.testing.assert_array_equal, many.agent, single.agent)
+
+
+def test_obstacles_differ_from_one_another_and_from_row_to_row():
+    states = driven(15)
+    place = states.obstacles.position[-1].reshape(-1, 2)
+    assert len(np.unique(place.round(5), axis=0)) == len(place)
+
+
+def test_relocated_obstacles_appear_inside_the_room_away_from_the_agent():
+    states = driven(15)
+    moved = jumps(states)
+    assert moved.sum() > 300
+    place = states.obstacles.position[1:]
+    gap = np.linalg.norm(place - states.agent.position[1:, :, None], axis=-1)
+    assert gap[moved].min() >= 1.0 - 1e-6
+    assert place.min() > 0.1
+    assert place.max() < 2.9
+    speeds = states.obstacles.speed[1:][moved]
+    on_grid = np.abs(speeds[:, None] - np.asarray(jam.OBSTACLE_SPEEDS)).min(axis=1) < 1e-6
+    assert on_grid.all()
+
+
+def test_obstacles_that_leave_are_moved_at_once_and_no_others_are():
+    states = driven(15)
+    moved = jumps(states)
+    before = jax.tree.map(lambda a: a[:-1], states.obstacles)
+    there = before.position + before.heading * before.speed[..., None]
+    outside = ((there <= 0.1) | (there >= 2.9)).any(axis=-1)
+    offset = np.abs(there[..., None, :] - np.asarray([[0.0, 0.0], [0.0, 3.0], [3.0, 0.0]]))
+    gone = outside | (offset < 0.5).all(axis=-1).any(axis=-1)
+    near = np.abs(offset - 0.5).min(axis=(-1, -2)) < 1e-5
+    near |= np.minimum(np.abs(there - 0.1), np.abs(there - 2.9)).min(axis=-1) < 1e-5
+    assert near.sum() < 50  # of 38,400
+    np.testing.assert_array_equal(moved[~near], gone[~near])
+
+
+def test_episodes_start_in_the_corner_and_obstacles_anywhere_a_unit_away():
+    states = jax.device_get(reset(keys_of(1, 2000), params_of(8)))
+    agent, others = states.agent, states.obstacles
+    np.testing.assert_allclose(agent.position, np.full((2000, 2), 0.2), atol=1e-7)
+    np.testing.assert_array_equal(agent.heading, np.tile([1.0, 0.0], (2000, 1)))
+    assert not agent.speed.any()
+    assert not states.time.any()
+    assert states.present.all()
+    np.testing.assert_array_equal(states.progress, np.full(2000, -74.0))  # 20 sqrt(2.4^2 + 2.8^2)
+
+    place = others.position.reshape(-1, 2)
+    assert np.linalg.norm(place - 0.2, axis=-1).min() >= 1 - 1e-6
+    assert place.min() >= 0.1 - 1e-6
+    assert place.max() <= 2.9 + 1e-6
+    # Uniform: where x > 1.3 nothing is too near to the agent.
+    right = place[place[:, 0] > 1.3]
+    assert stats.kstest(right[:, 0], "uniform", (1.3, 1.6)).pvalue > 1e-4
+    assert stats.kstest(right[:, 1], "uniform", (0.1, 2.8)).pvalue > 1e-4
+    grid = np.stack(np.meshgrid(*[np.linspace(0.1, 2.9, 2001)] * 2), axis=-1).reshape(-1, 2)
+    free = np.linalg.norm(grid - 0.2, axis=-1) >= 1
+    expected = (grid[free, 0] > 1.3).mean()
+    assert stats.binomtest(len(right), len(place), expected).pvalue > 1e-4
+    angle = np.arctan2(others.heading[..., 1], others.heading[..., 0]).reshape(-1)
+    assert stats.kstest(angle, "uniform", (-np.pi, 2 * np.pi)).pvalue > 1e-4
+    speeds, counts = np.unique(others.speed, return_counts=True)
+    np.testing.assert_allclose(speeds, jam.OBSTACLE_SPEEDS, atol=1e-7)
+    assert stats.chisquare(counts).pvalue > 1e-4
+
+
+def test_obstacles_are_drawn_independently_of_one_another():
+    place = jax.device_get(reset(keys_of(1, 2000), params_of(8))).obstacles.position
+    correlation = np.corrcoef(place[..., 0].T)
+    assert np.abs(correlation - np.eye(8)).max() < 4 / np.sqrt(2000)
+
+
+@functools.lru_cache
+def stepped():
+    """Draws of 1,000 steps, what they lead to, and what `step` leads to."""
+    params = params_of(8)
+
+    def both(key, action, params):
+        state = jam.reset(key, params)
+        draws = jam.draw(key, state, action, params)
+        whole = jam.step(key, state, action, params)
+        return draws, jam.transition(state, action, draws, params), whole
+
+    run = jax.jit(jax.vmap(both, (0, 0, None)))
+    return jax.device_get(run(keys_of(2, 1000), jnp.arange(1000) % 15, params))
+
+
+def test_a_step_is_the_transition_under_its_draws():
+    _, apart, whole = stepped()
+    jax.tree.map(np.testing.assert_array_equal, apart, whole)
+
+
+def test_obstacles_drive_by_the_frequencies_of_the_paper():
+    controls = stepped()[0].controls
+    turns = np.arctan2(controls.rotation[..., 1], controls.rotation[..., 0]).reshape(-1)
+    np.testing.assert_allclose(np.unique(turns.round(5)), [-0.15, -0.05, 0, 0.05, 0.15], atol=1e-6)
+    faster = np.digitize(controls.acceleration.reshape(-1), (-0.01, 0.01))
+    kind = 5 * faster + np.digitize(turns, (-0.1, -0.03, 0.03, 0.1))
+    expected = np.outer([0.2, 0.6, 0.2], [0.2] * 5).reshape(-1) * len(kind)
+    assert stats.chisquare(np.bincount(kind, minlength=15), expected).pvalue > 1e-4
+
+
+# An obstacle's position, and whether it is gone: (released, paper).
+PLACES = [
+    (AWAY, (False, False)),
+    ((0.1, 1.5), (True, True)),
+    ((0.101, 1.5), (False, False)),
+    ((2.9, 1.5), (True, True)),
+    ((1.5, 0.05), (True, True)),
+    ((1.5, 2.95), (True, True)),
+    ((2.6, 2.95), (True, True)),  # the exit is none for obstacles
+    ((0.3, 0.3), (True, True)),
+    ((0.3, 2.7), (True, True)),
+    ((2.7, 0.3), (True, True)),
+    ((2.7, 2.7), (False, False)),  # no zone beside the exit
+    ((0.45, 0.45), (True, False)),  # in the square, not in the quarter circle
+    ((0.45, 2.55), (True, False)),
+    ((2.55, 0.45), (True, False)),
+    ((0.52, 0.15), (False, False)),
+    ((0.15, 0.47), (True, True)),
+    ((0.2, 0.47), (True, False)),
+]
+
+
+def test_released_obstacles_are_relocated_from_outside_and_from_square_zones():
+    state, _, _ = settled(at((1.5, 1.0)), [place for place, _ in PLACES])
+    relocated = state.obstacles.position[:, 0] == 77.0
+    np.testing.assert_array_equal(relocated, [gone for _, (gone, _) in PLACES])
+    assert state.present.all()
+
+
+def test_obstacles_of_the_paper_disappear_outside_and_in_quarter_circles():
+    places = [place for place, _ in PLACES]
+    state, _, _ = settled(at((1.5, 1.0)), places, "paper")
+    np.testing.assert_array_equal(~state.present, [gone for _, (_, gone) in PLACES])
+    np.testing.assert_allclose(state.obstacles.position, places, atol=1e-6)
+    present = jam.hazards(state, params_of(17, "paper"))["obstacle"].present
+    np.testing.assert_array_equal(present, state.present)
+
+
+def test_an_obstacle_that_has_disappeared_never_returns_and_hits_nothing():
+    params = params_of(3, "paper")
+    # The agent stands on the first of three obstacles.
+    state = jam.start_at(at(AWAY), at([AWAY, (0.3, 1.5), (1.0, 2.0)]), params)
+    states = jax.tree.map(lambda a: jnp.stack([a] * 20), state)
+    for present, danger in ((True, 1), (False, 0)):
+        there = states.present.at[:, 0].set(present)
+        reached, outcome = step(keys_of(0, 20), states.replace(present=there), still(20), params)
+        assert (outcome.danger == danger).all()
+        assert (reached.present[:, 0] == present).all()
+    for seed in range(3):
+        reached, outcome = step(keys_of(seed, 20), reached, still(20), params)
+        assert not reached.present[:, 0].any()
+        assert not outcome.danger.any()
+    seen = np.asarray(observe(reached, params))[:, 360:392].reshape(20, 8, 4)
+    unseen = np.abs(seen[..., :2] - np.asarray(jam.UNSEEN)).max(axis=-1) < 1e-6
+    np.testing.assert_array_equal(unseen.sum(axis=1), np.full(20, 6))
+
+
+@pytest.mark.parametrize(("fidelity", "whole"), [("released", True), ("paper", False)])
+def test_progress_is_rounded_in_the_released_version_only(fidelity, whole):
+    state, outcome, _ = settled(at((1.0, 1.0), 0.8, 0.1), [(2.5, 1.0)], fidelity)
+    to_go = np.asarray([2.6, 3.0]) - np.asarray([[1.0, 1.0], state.agent.position])
+    before, after = -20 * np.linalg.norm(to_go, axis=-1)
+    if whole:
+        before, after = np.round(before), np.round(after)
+    np.testing.assert_allclose(state.progress, after, atol=1e-4)
+    np.testing.assert_allclose(outcome.reward, after - before - 0.05, atol=1e-4)
+    assert (float(state.progress) == round(float(state.progress))) == whole
+
+
+@pytest.mark.parametrize("fidelity", jam.FIDELITIES)
+def test_rewards_add_up_to_the_progress_made_less_the_costs(fidelity):
+    params = params_of(3, fidelity)
+    states = reset(keys_of(6, 20), params)
+    start, total = states.progress, np.zeros(20)
+    for t in range(8):
+        states, outcome = step(keys_of(t, 20), states, jnp.full(20, 12 if t < 5 else 9), params)
+        total += np.asarray(outcome.reward)
+    # From rest the speed is .02 after the first step: it never stands still.
+    np.testing.assert_allclose(total, states.progress - start - 8 * 0.05, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("speed", "cost"), [(0.0, 0.1), (0.004, 0.1), (-0.004, 0.1), (0.006, 0.05)]
+)
+def test_standing_still_costs_twice_the_price_of_time(speed, cost):
+    _, outcome, _ = settled(at((1.5, 1.0), 0.0, speed), [(2.5, 2.0)])
+    np.testing.assert_allclose(outcome.reward, -cost, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("position", "goal"), [((2.6, 2.95), True), ((2.4, 2.91), True), ((2.6, 2.89), False)]
+)
+def test_driving_out_of_the_exit_is_the_goal(position, goal):
+    state, outcome, _ = settled(at(position, np.pi / 2, 0.1), [(1.0, 1.0)])
+    assert bool(outcome.goal) == bool(outcome.terminated) == goal
+    assert outcome.danger == 0
+    progress = np.round(20 * np.hypot(position[0] - 2.6, position[1] - 3)) + state.progress
+    np.testing.assert_allclose(outcome.reward, progress - 0.05 + 10 * goal, atol=1e-4)
+
+
+def test_a_crash_in_the_exit_is_no_goal():
+    state, outcome, hit = settled(at((2.6, 2.95), np.pi / 2, 0.1), [(2.7, 2.89)])
+    assert hit["obstacle"]
+    assert state.agent.position[1] > 3
+    assert not outcome.goal
+    assert outcome.terminated
+    assert outcome.danger == 1
+    assert outcome.reward < 1
+
+
+@pytest.mark.parametrize(
+    ("position", "wall"),
+    [
+        ((0.11, 1.5), False),
+        ((0.09, 1.5), True),
+        ((2.95, 1.5), True),
+        ((1.5, 0.05), True),
+        ((1.5, 2.95), True),
+        ((2.6, 2.95), False),
+        ((2.25, 2.95), True),  # the edge of the exit
+        ((2.95, 2.95), True),
+    ],
+)
+def test_a_wall_point_nearer_than_the_radius_is_a_crash(position, wall):
+    _, outcome, hit = settled(at(position), [(1.0, 1.0)])
+    assert bool(hit["wall"]) == bool(outcome.danger) == wall
+    assert not hit["obstacle"]
+
+
+@pytest.mark.parametrize(("gap", "crash"), [(0.19, True), (0.21, False)])
+def test_centres_nearer_than_two_radii_are_a_crash(gap, crash):
+    near = (1.5 + gap * np.cos(1.0), 1.5 + gap * np.sin(1.0))
+    _, outcome, hit = settled(at(AWAY), [(2.5, 2.0), near, (2.5, 2.0)])
+    assert bool(hit["obstacle"]) == bool(outcome.danger) == crash
+    assert not hit["wall"]
+
+
+@pytest.mark.parametrize("num_obstacles", [3, 8, 50])
+def test_the_eight_nearest_obstacles_are_seen_in_the_order_of_their_distance(num_obstacles):
+    params = params_of(num_obstacles)
+    states = reset(keys_of(7, 20), params)
+    rng = np.random.default_rng(0)
+    agents = at(rng.uniform(0.5, 2.5, (20, 2)), rng.uniform(-3, 3, 20), rng.uniform(-0.1, 0.1, 20))
+    states = jax.device_get(states.replace(agent=agents))
+    seen = np.asarray(observe(states, params), np.float64)[:, 360:]
+    turn = lambda vector: vector[..., 0] + 1j * vector[..., 1]  # noqa: E731
+    agent, others = states.agent, states.obstacles
+    ahead = turn(agent.heading.astype(float))[:, None]
+    offset = turn(others.position.astype(float)) - turn(agent.position.astype(float))[:, None]
+    facing, speed = turn(others.heading.astype(float)), others.speed
+    pad = max(0, 8 - num_obstacles)
+    if pad:
+        offset = np.hstack([offset, np.full((20, pad), turn(np.asarray(jam.UNSEEN)))])
+        facing = np.hstack([facing, np.repeat(-ahead, pad, axis=1)])
+        speed = np.hstack([speed, np.repeat(agent.speed[:, None], pad, axis=1)])
+    order = np.argsort(np.abs(offset), axis=1, kind="stable")[:, :8]
+    nearest = lambda values: np.take_along_axis(values, order, axis=1)  # noqa: E731
+    local, way = nearest(offset / ahead), np.angle(nearest(facing / ahead))
+    rows = seen[:, :32].reshape(20, 8, 4)
+    np.testing.assert_allclose(rows[..., 0] + 1j * rows[..., 1], local, atol=1e-5)
+    np.testing.assert_allclose(np.exp(1j * rows[..., 2]), np.exp(1j * way), atol=1e-5)
+    np.testing.assert_allclose(rows[..., 3], nearest(speed), atol=1e-6)
+    np.testing.assert_allclose(seen[:, 32:34], agent.position, atol=1e-6)
+    np.testing.assert_allclose(seen[:, 34], np.angle(ahead[:, 0]), atol=1e-5)
+    np.testing.assert_allclose(seen[:, 35], agent.speed, atol=1e-6)
+
+
+def test_fifty_obstacles_can_be_driven_among():
+    params = params_of(50)
+    states = reset(keys_of(8, 20), params)
+    for t in range(5):
+        states, outcome = step(keys_of(t, 20), states, jnp.full(20, 12), params)
+    assert states.obstacles.position.shape == (20, 50, 2)
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves((states, outcome)))
+    first = jax.tree.map(lambda a: a[0], states)
+    assert jam.hazards(first, params)["obstacle"].present.shape == (50,)
+
+
+def test_states_far_from_the_room_can_be_stepped_and_observed():
+    params = params_of(3)
+    states = reset(keys_of(9, 20), params)
+    rng = np.random.default_rng(0)
+    agents = at(rng.uniform(-60, 60, (20, 2)), rng.uniform(-9, 9, 20), np.full(20, 7.0))
+    others = at(rng.uniform(-60, 60, (20, 3, 2)), 0.0, -3.0)
+    states = states.replace(agent=agents, obstacles=others)
+    reached, outcome = step(keys_of(0, 20), states, still(20), params)
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves((reached, outcome)))
+    assert jnp.isfinite(observe(reached, params)).all()
+    assert (reached.obstacles.position > 0).all()  # brought back into the room
+    assert (reached.obstacles.position < 3).all()
+
+
+def test_every_wall_point_within_the_threats_window_is_a_hazard():
+    params = params_of(3)
+    rng = np.random.default_rng(1)
+    agents = at(rng.uniform(0.1, 3.1, (200, 2)), rng.uniform(-3, 3, 200), np.zeros(200))
+    hazards = jax.jit(jax.vmap(lambda agent: jam.hazards(blank(agent), params)["wall"]))
+
+    def blank(agent):
+        return jam.start_at(agent, at(np.full((3, 2), 1.5)), params)
+
+    points, present = jax.device_get(hazards(agents))
+    np.testing.assert_array_equal(present, points[..., 0] < FAR)
+    window = jax.device_get(params.wall.window)
+
+    def inside(points):
+        offset = points - np.asarray(agents.position)[:, None]
+        c, s = np.asarray(agents.heading).T[..., None]
+        x, y = offset[..., 0] * c + offset[..., 1] * s, offset[..., 1] * c - offset[..., 0] * s
+        return window.contains(np.stack([x, y], axis=-1))
+
+    expected = inside(jam.wall_points().astype(np.float32)[None]).sum(axis=1)
+    np.testing.assert_array_equal((inside(points) & present).sum(axis=1), expected)
+    assert (expected > 0).mean() > 0.3
+
+
+def test_the_walls_stand_around_the_room_but_not_in_the_exit(golden):
+    walls = jam.wall_points()
+    assert walls.shape == (559, 2) == np.unique(walls.round(9), axis=0).shape
+    on_edge = np.isclose(walls, 0) | np.isclose(walls, 3)
+    assert on_edge.any(axis=1).all()
+    top = walls[np.isclose(walls[:, 1], 3) & (walls[:, 0] > 2.19)]
+    assert len(top) == 0
+    recorded = np.unique(golden("traces_jam")["wall"].round(9), axis=0)
+    np.testing.assert_allclose(np.unique(walls.round(9), axis=0), recorded, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"fidelity": "exact"}, "^fidelity is 'exact'; it must be one of 'released', 'paper'"),
+        ({"num_obstacles": 0}, "^num_obstacles is 0; it must be an integer, at least 1"),
+        ({"num_obstacles": 2.5}, r"^num_obstacles is 2\.5; it must be an integer"),
+        ({"num_obstacles": 10_000}, "^num_obstacles is 10000; it must be .* at most"),
+        ({"time_limit": -1}, "^time_limit is -1; it must be an integer, above 0"),
+        ({"radius": 0.5}, r"^radius is 0\.5; it must be a finite number, above 0, at most 0\.2"),
+        ({"beta": 0}, "^beta is 0; it must be a finite number, above 0, at most 1"),
+        ({"wall_horizon": 0}, "^wall_horizon is 0; it must be an integer"),
+        ({"obstacle_horizon": 0.5}, r"^obstacle_horizon is 0\.5; it must be an integer"),
+    ],
+)
+def test_parameters_out_of_range_are_named(settings, message):
+    with pytest.raises(ValueError, match=message):
+        jam.make_params(**settings)
+
+
+def test_there_are_fifteen_actions_of_three_accelerations_and_five_turns():
+    params = params_of(8)
+    assert jam.num_actions(params) == 15
+    np.testing.assert_allclose(params.agent.actions.acceleration[::5], [-0.02, 0, 0.02])
+    turns = angle_of(params.agent.actions.rotation[:5])
+    np.testing.assert_allclose(turns, [-0.3, -0.1, 0, 0.1, 0.3], atol=1e-6)

@@ -1,0 +1,108 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probe
+import pytest
+
+from rp_jax.envs import circuit
+from rp_jax.planning.pmdp import encode
+
+PARAMS = probe.make_params()
+
+
+def states(cells):
+    return jax.vmap(probe.start_at)(jnp.asarray(cells, float))
+
+
+def test_bins_where_nothing_is_seen_are_the_farthest():
+    observation = jnp.asarray([0.0, 0.5, 1.0, 0.2, 3.0, -4.0])
+    encoded = encode(observation, 4, 1)
+    assert encoded.scan.dtype == jnp.uint8
+    assert encoded.scan.tolist() == [255, 128, 255, 51]  # 127.5 rounds to even
+    np.testing.assert_array_equal(encoded.rest, [3.0, -4.0])
+
+
+def test_pooling_keeps_the_nearest_of_its_neighbours():
+    scan = [0.0, 0.9, 0.4, 0.0, 0.0, 0.0, 0.1, 1.0]
+    encoded = encode(jnp.asarray([*scan, 7.0]), 8, 2)
+    assert encoded.scan.tolist() == [230, 102, 255, 26]
+    assert encode(jnp.asarray([*scan, 7.0]), 8, 4).scan.tolist() == [102, 26]
+    assert encode(jnp.asarray([*scan, 7.0]), 8, 8).scan.tolist() == [26]
+
+
+def test_pooling_never_hides_what_is_nearer():
+    rng = np.random.default_rng(0)
+    scan = np.where(rng.random((50, 360)) < 0.4, 0.0, rng.uniform(0.01, 1, (50, 360)))
+    rest = np.zeros((50, 2))
+    observations = jnp.asarray(np.concatenate([scan, rest], axis=-1), jnp.float32)
+    one, eight = (jax.vmap(encode, (0, None, None))(observations, 360, p).scan for p in (1, 8))
+    np.testing.assert_array_equal(eight, np.asarray(one).reshape(50, 45, 8).min(axis=-1))
+
+
+def test_it_perceives_what_is_there():
+    pmdp = probe.make_pmdp(probe, PARAMS)
+    percept = jax.jit(pmdp.perceive)(states([1, 4, 5, 6]))
+    assert percept.encoded.scan.shape == (4, 2)
+    np.testing.assert_array_equal(percept.encoded.scan, [[64, 255]] * 4)
+    np.testing.assert_array_equal(percept.encoded.rest[:, 0], [1, 4, 5, 6])
+    # stay, left, right; in the pit all is lost, and the first of equals is taken
+    free, beside, lost = [True, True, True], [True, True, False], [True, False, False]
+    np.testing.assert_array_equal(percept.admissible, [free, free, beside, lost])
+    np.testing.assert_array_equal(percept.secure, [True, True, True, False])
+    expected = [[0, 0, 0], [0, 0, 0], [0, 0, 1], [1, 1, 1]]
+    np.testing.assert_allclose(percept.threat, expected, atol=1e-6)
+
+
+def test_without_models_all_is_admissible():
+    pmdp = probe.make_pmdp(probe, PARAMS, x=np.inf)
+    percept = jax.jit(pmdp.perceive)(states([1, 5, 6]))
+    assert percept.admissible.all()
+    assert percept.secure.all()
+    np.testing.assert_array_equal(percept.threat, np.zeros((3, 3)))
+    assert percept.threat.dtype == jnp.float32
+
+
+def test_an_infinite_threshold_admits_all_in_spite_of_models():
+    pmdp = probe.make_pmdp(probe, PARAMS, x=np.inf, models={"pit": probe.threat_model(PARAMS)})
+    percept = jax.jit(pmdp.perceive)(states([5, 6]))
+    assert percept.admissible.all()
+    assert percept.threat[1].min() > 0.99
+
+
+def test_the_dead_have_no_threat_and_the_living_keep_theirs():
+    pmdp = probe.make_pmdp(probe, PARAMS)
+    here = states([5, 5, 6, 4])
+    alive = jnp.asarray([True, False, False, True])
+    all_of_them = jax.jit(pmdp.perceive)(here)
+    some = jax.jit(pmdp.perceive)(here, alive)
+    np.testing.assert_array_equal(some.threat[0], all_of_them.threat[0])
+    np.testing.assert_array_equal(some.threat[3], all_of_them.threat[3])
+    np.testing.assert_array_equal(some.threat[1:3], np.zeros((2, 3)))
+    np.testing.assert_array_equal(some.admissible[0], all_of_them.admissible[0])
+    np.testing.assert_array_equal(some.encoded.rest, all_of_them.encoded.rest)
+
+
+@pytest.mark.parametrize("pool", [1, 8])
+def test_circuit_is_perceived_as_it_is_observed(pool):
+    params = circuit.make_params("circle")
+    pmdp = probe.make_pmdp(circuit, params, x=np.inf, pool=pool)
+    start = jax.vmap(circuit.reset, (0, None))(jax.random.split(jax.random.key(0), 3), params)
+    percept = jax.jit(pmdp.perceive)(start)
+    seen = np.asarray(jax.jit(jax.vmap(circuit.observe, (0, None)))(start, params))
+    nearest = np.where(seen[:, :360] == 0, 1, seen[:, :360]).reshape(3, -1, pool).min(axis=-1)
+    assert percept.encoded.scan.shape == (3, 360 // pool)
+    assert np.abs(np.asarray(percept.encoded.scan, float) - 255 * nearest).max() <= 0.5 + 1e-3
+    assert (nearest < 1).any()
+    np.testing.assert_allclose(percept.encoded.rest, seen[:, 360:], rtol=1e-6)
+
+
+def test_the_threshold_and_the_penalty_can_be_swept():
+    pmdp = probe.make_pmdp(probe, PARAMS)
+    sweep = pmdp.replace(x=jnp.asarray([0.5, 1e-12, jnp.inf]))
+    axes = pmdp.replace(
+        params=None, threats=None, x=0, penalty=None
+    )  # the same shape, with the axes as leaves
+    percepts = jax.jit(jax.vmap(lambda p, s: p.perceive(s), (axes, None)))(sweep, states([5, 6]))
+    right = percepts.admissible[:, 0, probe.RIGHT]
+    np.testing.assert_array_equal(right, [False, False, True])
+    np.testing.assert_array_equal(percepts.secure[:, 0], [True, False, True])

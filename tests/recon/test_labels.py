@@ -1,0 +1,260 @@
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rp_jax.envs import circuit, jam
+from rp_jax.kinematics import make_vehicle
+from rp_jax.recon.labels import Labels, best_estimator, exact_threat, label, monte_carlo_threat
+
+WALLS = [(circuit, "threat_truth_circuit_wall"), (jam, "threat_truth_jam_wall")]
+PATHS = 4096  # of the fixture `monte_carlo`
+STILL = 7  # the action of neither acceleration nor turn
+
+
+enumerate_all = jax.jit(exact_threat)
+enumerate_each = jax.jit(jax.vmap(exact_threat, (None, 0, 0, None)))
+simulate = jax.jit(monte_carlo_threat, static_argnames="paths")
+
+
+@functools.lru_cache
+def subs_of(env, double):
+    assert double == jax.config.jax_enable_x64
+    return env.sub_rmdps(env.make_params())
+
+
+def sub_of(env, kind):
+    return subs_of(env, jax.config.jax_enable_x64)[kind]
+
+
+def with_source(sub, **changes):
+    return sub.replace(source=sub.source.replace(**changes))
+
+
+def with_agent(sub, **changes):
+    return sub.replace(agent=sub.agent.replace(**changes))
+
+
+def of_cars(states):
+    """Features of states (x, y, relative heading, its speed, the agent's speed)."""
+    x, y, turn, *speeds = states.T
+    return jnp.asarray(np.stack([x, y, np.cos(turn), np.sin(turn), *speeds], axis=-1), float)
+
+
+@pytest.mark.parametrize(("env", "name"), WALLS)
+def test_enumerated_threats_of_walls_are_the_recorded_ones(env, name, golden, exact, precision):
+    data = golden(name)
+    found = exact(jnp.asarray(data["states"], float), sub_of(env, "wall"))
+    tolerance = {"float64": 1e-6, "float32": 1e-5}[precision]
+    assert found.threat.dtype == precision
+    np.testing.assert_allclose(found.threat, data["truth"], rtol=0, atol=tolerance)
+    assert (np.asarray(found.stderr) == 0).all()
+
+
+@pytest.mark.parametrize(("env", "name"), WALLS)
+def test_simulated_threats_of_walls_agree_with_the_enumerated_ones(env, name, golden, monte_carlo):
+    data = golden(name)
+    states, truth = data["states"][:150], data["truth"][:150]
+    features = jnp.asarray(states, float)
+    found = monte_carlo(jax.random.key(1), features, sub_of(env, "wall"))
+    error = np.sqrt(truth * (1 - truth) / PATHS + PATHS**-2.0)
+    assert ((truth > 0.01) & (truth < 0.99)).sum() > 150
+    assert np.abs((found.threat - truth) / error).max() < 4.5
+
+
+@pytest.fixture(scope="module")
+def cars(golden, monte_carlo):
+    """Simulated labels of the recorded obstacles, their recorded threats and standard errors."""
+    data = golden("threat_truth_jam_car")
+    join = lambda name: np.concatenate([data[name], data[f"{name}_near"]])  # noqa: E731
+    features = of_cars(join("states"))
+    assert features.shape == (150, 6)
+    found = monte_carlo(jax.random.key(2), features, sub_of(jam, "obstacle"))
+    return found, join("truth"), join("stderr")
+
+
+def test_simulated_threats_of_obstacles_agree_with_the_recorded_ones(cars):
+    found, truth, spread = cars
+    error = np.sqrt(truth * (1 - truth) / PATHS + spread**2 + PATHS**-2.0)
+    z = (np.asarray(found.threat, np.float64) - truth) / error
+    assert z.shape == (150, 15)
+    assert np.abs(z).max() < 4
+    # Neither biased, nor nearer than chance allows.
+    undecided = (truth > 0.01) & (truth < 0.99)
+    assert undecided.sum() > 200
+    assert abs(z[undecided].mean()) < 0.3
+    assert 0.8 < z[undecided].std() < 1.2
+
+
+def test_the_reported_error_is_that_of_the_estimate(cars):
+    found, truth, _ = cars
+    undecided = (truth > 0.05) & (truth < 0.95)
+    assert undecided.sum() > 100
+    expected = np.sqrt(truth * (1 - truth) / PATHS)
+    np.testing.assert_allclose(found.stderr[undecided], expected[undecided], rtol=0.15)
+
+
+def test_skipping_the_last_control_of_a_delayed_agent_changes_nothing():
+    sub = with_source(sub_of(jam, "wall"), horizon=3)
+    rng = np.random.default_rng(0)
+    states = rng.uniform([-0.2, -0.25, -0.1], [0.4, 0.25, 0.1], (300, 3))
+    agents, points = jax.vmap(sub.source.state_of)(jnp.asarray(states, float))
+    key = jax.random.key(0)
+    short = enumerate_each(key, agents, points, sub).threat
+    long = enumerate_each(key, agents, points, with_agent(sub, delayed=False)).threat
+    assert ((long > 0.01) & (long < 0.99)).sum() > 100
+    np.testing.assert_allclose(short, long, atol=1e-6)
+
+
+def wall_within(steps, beta=0.999):
+    return with_source(sub_of(jam, "wall"), horizon=steps).replace(beta=jnp.asarray(beta))
+
+
+def threats_of(x, speed, beta=0.999):
+    """Of a wall point straight ahead, within three steps: enumerated, and simulated."""
+    agent, wall = make_vehicle((0.0, 0.0), 0.0, speed), jnp.asarray([x, 0.0])
+    sub = wall_within(3, beta)
+    key = jax.random.key(0)
+    return enumerate_all(key, agent, wall, sub), simulate(key, agent, wall, sub, paths=8)
+
+
+def test_what_is_hit_already_threatens_every_action_by_one():
+    for found in threats_of(0.05, 0.1):
+        np.testing.assert_array_equal(found.threat, np.ones(15))
+    agent, _, sub = uncertain()
+    other = make_vehicle((0.1, 0.1), 0.0, 0.06)
+    found = simulate(jax.random.key(0), agent, other, sub, paths=200)
+    np.testing.assert_array_equal(found.threat, np.ones(15))
+
+
+@pytest.mark.parametrize("beta", [0.5, 0.999, 1.0])
+def test_the_threat_of_a_certain_hit_is_beta_to_the_power_of_its_step(beta):
+    for ahead, steps in ((0.15, 1), (0.25, 2)):
+        for found in threats_of(ahead, 0.1, beta):
+            np.testing.assert_allclose(found.threat[STILL], beta**steps, rtol=1e-6)
+            np.testing.assert_allclose(found.stderr[STILL], 0.0, atol=1e-7)
+
+
+def test_the_first_move_is_the_same_whatever_the_action():
+    # The vehicle moves by its old speed, so a wall hit at step 1 is hit under all actions.
+    for found in threats_of(0.15, 0.1):
+        np.testing.assert_allclose(found.threat, np.full(15, 0.999), rtol=1e-6)
+
+
+def test_braking_at_once_delays_a_hit_by_a_step():
+    exact, _ = threats_of(0.285, 0.1)
+    # Two steps lead .18 ahead after braking, .2 after not; the third leads past .185.
+    expected = [0.999**3, 0.999**2, 0.999**2]
+    np.testing.assert_allclose(exact.threat[jnp.asarray([2, 7, 12])], expected, rtol=1e-6)
+
+
+def test_the_probabilities_of_the_baseline_weigh_the_branches():
+    # From rest, action 12 drives .02 at step 2; .06 in all at step 3 only if the baseline
+    # accelerates again, and that has probability .2. No other action gets past .055.
+    exact, _ = threats_of(0.155, 0.0, beta=1.0)
+    np.testing.assert_allclose(exact.threat[12], 0.2, rtol=1e-6)
+    np.testing.assert_allclose(exact.threat[:10], np.zeros(10), atol=1e-7)
+
+
+def test_beta_weighs_later_hits_less(exact, golden):
+    data = golden("threat_truth_jam_wall")
+    features = jnp.asarray(data["states"], float)
+    sub = sub_of(jam, "wall")
+    found = [
+        np.asarray(exact(features, sub.replace(beta=jnp.asarray(beta))).threat, np.float64)
+        for beta in (0.5, 0.9, 1.0)
+    ]
+    # As E[beta^K], it lies between beta^5 and beta times the chance of a hit from step 1 on.
+    later = found[2] * (found[0] < 1)
+    for beta, threat in zip((0.5, 0.9), found, strict=False):
+        assert (threat[found[0] < 1] <= beta * later[found[0] < 1] + 1e-6).all()
+        assert (threat >= beta**5 * later - 1e-6).all()
+    assert found[2].max() <= 1 + 1e-6
+
+
+@pytest.mark.parametrize(("env", "kind"), [(circuit, "wall"), (jam, "wall"), (jam, "obstacle")])
+def test_outside_the_window_there_is_no_threat(env, kind, exact, monte_carlo):
+    sub = sub_of(env, kind)
+    low = np.asarray(sub.source.window.lower, float) - 1e-3
+    high = np.asarray(sub.source.window.upper, float) + 1e-3
+    rows = 250 if kind == "wall" else 150
+    rng = np.random.default_rng(0)
+    where = rng.uniform(low, high, (rows, 2))
+    side = rng.integers(2, size=rows)  # this coordinate is put on the rim
+    where[np.arange(rows), side] = np.where(rng.random(rows) < 0.5, low[side], high[side])
+    speed = rng.choice(np.asarray(sub.agent.speeds)[[0, -1]], (rows, 1))
+    if kind == "wall":
+        found = exact(jnp.asarray(np.hstack([where, speed]), float), sub)
+    else:
+        home = -where / np.linalg.norm(where, axis=-1, keepdims=True)  # they drive at the agent
+        features = np.hstack([where, home, np.full((rows, 1), 0.06), speed])
+        found = monte_carlo(jax.random.key(0), jnp.asarray(features, float), sub)
+    assert (np.asarray(found.threat) == 0).all()
+
+
+def uncertain():
+    """An obstacle ahead that a vehicle may or may not hit within four steps."""
+    agent, other = make_vehicle((0.0, 0.0), 0.0, 0.06), make_vehicle((0.6, 0.0), 3.0, 0.06)
+    return agent, other, with_source(sub_of(jam, "obstacle"), horizon=4)
+
+
+def test_the_standard_error_shrinks_with_the_root_of_the_paths():
+    few, many = (simulate(jax.random.key(0), *uncertain(), paths=n) for n in (200, 5000))
+    undecided = np.asarray((many.threat > 0.1) & (many.threat < 0.9))
+    assert undecided.sum() > 3
+    np.testing.assert_allclose((few.stderr / many.stderr)[undecided], 5.0, rtol=0.3)
+
+
+def test_simulated_threats_are_a_function_of_the_key():
+    first, again, other = (
+        simulate(jax.random.key(k), *uncertain(), paths=200).threat for k in (0, 0, 1)
+    )
+    np.testing.assert_array_equal(first, again)
+    assert (np.asarray(first) != np.asarray(other)).any()
+
+
+def test_one_path_claims_no_precision():
+    found = simulate(jax.random.key(0), *uncertain(), paths=1)
+    np.testing.assert_array_equal(found.stderr, np.ones(15))
+
+
+def test_hazards_that_stay_put_are_enumerated_and_others_simulated():
+    assert best_estimator(sub_of(jam, "wall"), 64) is exact_threat
+    agent, other, sub = uncertain()
+    found = jax.jit(best_estimator(sub, 200))(jax.random.key(0), agent, other, sub)
+    expected = simulate(jax.random.key(0), agent, other, sub, paths=200)
+    np.testing.assert_array_equal(found.threat, expected.threat)
+
+
+def test_labelling_in_calls_gives_every_row_its_own_label():
+    sub = with_source(sub_of(jam, "wall"), horizon=3)
+    rng = np.random.default_rng(0)
+    states = rng.uniform([-0.2, -0.25, -0.1], [0.4, 0.25, 0.1], (300, 3))
+    agents, points = jax.vmap(sub.source.state_of)(jnp.asarray(states, float))
+    calls = []
+    found = label(
+        jax.random.key(0),
+        agents,
+        points,
+        sub,
+        exact_threat,
+        batch=8,
+        rows=128,
+        on_progress=lambda done, total: calls.append((done, total)),
+    )
+    expected = enumerate_each(jax.random.key(0), agents, points, sub)
+    assert calls == [(128, 300), (256, 300), (300, 300)]
+    np.testing.assert_allclose(found.threat, expected.threat, atol=1e-6)
+    assert found.stderr.shape == (300, 15)
+
+
+def test_every_row_is_labelled_with_a_key_of_its_own():
+    def noise(key, agent, hazard, sub):
+        return Labels(threat=jax.random.uniform(key, (3,)), stderr=jnp.zeros(3))
+
+    agents, points = make_vehicle(np.zeros((40, 2)), np.zeros(40), np.zeros(40)), jnp.zeros((40, 2))
+    found = label(jax.random.key(0), agents, points, sub_of(jam, "wall"), noise, rows=16).threat
+    assert found.shape == (40, 3)
+    assert np.unique(np.asarray(found)).size == 120

@@ -1,0 +1,282 @@
+import errno
+import json
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rp_jax import storage
+from rp_jax.storage import StorageError
+
+as_root = os.geteuid() == 0 if hasattr(os, "geteuid") else False
+
+
+def fail(*args, **kwargs):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_written_file_holds_exactly_what_was_written(tmp_path):
+    path = tmp_path / "file"
+    storage.write_bytes(path, b"one")
+    storage.write_bytes(path, b"two\x00\xff")
+    assert path.read_bytes() == b"two\x00\xff"
+    assert names(tmp_path) == ["file"]
+    assert path.stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace", "chmod"])
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(step, tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    storage.write_bytes(path, b"old")
+    monkeypatch.setattr(os, step, fail)
+    with pytest.raises(StorageError, match=r"file: cannot be written \(No space left on device\)"):
+        storage.write_bytes(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert names(tmp_path) == ["file"]
+
+
+def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
+    path = tmp_path / "file"
+    storage.write_bytes(path, b"old")
+    monkeypatch.setattr(os, "replace", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        storage.write_bytes(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert names(tmp_path) == ["file"]
+
+
+def test_data_is_on_disk_before_the_name_points_to_it(tmp_path, monkeypatch):
+    order = []
+    fsync, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda f: (order.append("fsync"), fsync(f)))
+    monkeypatch.setattr(os, "replace", lambda *a: (order.append("replace"), replace(*a)))
+    storage.write_bytes(tmp_path / "file", b"data")
+    assert order == ["fsync", "replace", "fsync"]  # the file, its name, the folder
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    with pytest.raises(StorageError, match="nowhere/file: cannot be written"):
+        storage.write_bytes(tmp_path / "nowhere" / "file", b"data")
+    assert names(tmp_path) == []
+
+
+@pytest.mark.skipif(as_root, reason="root may write anywhere")
+def test_a_folder_without_permission_is_named(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(StorageError, match="Permission denied"):
+        storage.write_bytes(tmp_path / "file", b"data")
+    with pytest.raises(StorageError, match="out is .*cannot be"):
+        storage.new_folder(tmp_path / "new")
+    with pytest.raises(StorageError, match="out is .*cannot be written"):
+        storage.new_folder(tmp_path)
+    tmp_path.chmod(0o700)
+
+
+class Point(NamedTuple):
+    x: float
+    y: float
+
+
+@pytest.mark.parametrize(
+    ("value", "read"),
+    [
+        (float("nan"), None),
+        (float("inf"), "inf"),
+        (-float("inf"), "-inf"),
+        (np.float32("nan"), None),
+        (np.float64("inf"), "inf"),
+        (np.int32(3), 3),
+        (np.bool_(True), True),
+        (np.asarray([1.5, np.nan]), [1.5, None]),
+        (jnp.asarray([[1, 2]]), [[1, 2]]),
+        (jnp.asarray(-jnp.inf), "-inf"),
+        (Path("a") / "b", "a/b"),
+        ((1, (2.5, "x")), [1, [2.5, "x"]]),
+        (Point(1.0, float("nan")), [1.0, None]),
+        ({3: {"a": float("inf")}}, {"3": {"a": "inf"}}),
+        (None, None),
+        (False, False),
+    ],
+)
+def test_json_is_strict_whatever_is_written(value, read, tmp_path):
+    path = tmp_path / "value.json"
+    storage.write_json(path, {"value": value})
+    text = path.read_text()
+    assert text.endswith("}\n")
+    strict = json.loads(text, parse_constant=lambda name: pytest.fail(name))
+    assert strict == {"value": read}
+    assert type(strict["value"]) is type(read)
+
+
+def test_what_is_not_json_leaves_the_old_file(tmp_path):
+    path = tmp_path / "value.json"
+    storage.write_json(path, 1)
+    with pytest.raises(TypeError):
+        storage.write_json(path, {"value": object()})
+    assert path.read_text() == "1\n"
+    assert names(tmp_path) == ["value.json"]
+
+
+def test_a_new_folder_is_made_with_its_parents(tmp_path):
+    folder = storage.new_folder(tmp_path / "a" / "b")
+    assert folder.is_dir()
+    assert storage.new_folder(folder) == folder  # empty: still new
+    assert storage.new_folder(str(tmp_path / "c")) == tmp_path / "c"
+
+
+def test_a_folder_with_anything_in_it_is_refused(tmp_path):
+    (tmp_path / ".hidden").touch()
+    with pytest.raises(StorageError, match="out is .* must be a new or an empty folder"):
+        storage.new_folder(tmp_path)
+    with pytest.raises(StorageError, match="out is .* must be a new or an empty folder"):
+        storage.new_folder(tmp_path / ".hidden")
+
+
+def test_a_folder_under_a_file_is_refused(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(StorageError, match=r"out is .*it cannot be created \(Not a directory\)"):
+        storage.new_folder(tmp_path / "file" / "folder")
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "a\0b"])
+def test_an_impossible_name_is_refused(name, tmp_path):
+    with pytest.raises(ValueError, match=r"cannot be created|null byte"):
+        storage.new_folder(tmp_path / name)
+
+
+TREE = {
+    "a": [jnp.asarray([[1.5, -0.0, jnp.nan]]), jnp.asarray(7, jnp.int32)],
+    "b": Point(jnp.asarray([], jnp.float32), jnp.asarray([True, False])),
+    "bytes": jnp.arange(256, dtype=jnp.uint8),
+}
+
+
+def test_a_tree_comes_back_bit_by_bit(tmp_path):
+    storage.save(tmp_path / "new" / "folder", "thing", TREE, {"note": 1})
+    like = jax.tree.map(jnp.zeros_like, TREE)
+    found = storage.load(tmp_path / "new" / "folder", "thing", like)
+    assert jax.tree.structure(found) == jax.tree.structure(TREE)
+    for have, want in zip(jax.tree.leaves(found), jax.tree.leaves(TREE), strict=True):
+        assert have.dtype == want.dtype
+        assert have.shape == want.shape
+        assert np.asarray(have).tobytes() == np.asarray(want).tobytes()
+    assert storage.read_manifest(tmp_path / "new" / "folder", "thing")["about"] == {"note": 1}
+
+
+def test_saving_again_replaces(tmp_path):
+    storage.save(tmp_path, "thing", TREE, {})
+    storage.save(tmp_path, "thing", {"a": jnp.ones(2)}, {})
+    np.testing.assert_array_equal(storage.load(tmp_path, "thing", {"a": jnp.zeros(2)})["a"], 1)
+    assert names(tmp_path) == ["arrays.npz", "manifest.json"]
+
+
+def test_leaves_are_named_by_their_paths():
+    assert set(storage.leaves(TREE)) == {"a/0", "a/1", "b/x", "b/y", "bytes"}
+
+
+@pytest.mark.parametrize(
+    ("like", "message"),
+    [
+        ({"a": jnp.zeros(3)}, r"a is float32\[2\]; it must be float32\[3\]"),
+        ({"a": jnp.zeros(2, jnp.int32)}, r"a is float32\[2\]; it must be int32\[2\]"),
+        ({"a": jnp.zeros(2), "b": jnp.zeros(2)}, "missing or too many: b"),
+        ({}, "missing or too many: a"),
+    ],
+)
+def test_another_shape_type_or_name_is_refused(like, message, tmp_path):
+    storage.save(tmp_path, "thing", {"a": jnp.ones(2)}, {})
+    with pytest.raises(StorageError, match=message):
+        storage.load(tmp_path, "thing", like)
+
+
+def test_another_kind_is_refused(tmp_path):
+    storage.save(tmp_path, "thing", {"a": jnp.ones(2)}, {})
+    with pytest.raises(StorageError, match="kind is 'thing'; it must be 'threat function'"):
+        storage.load(tmp_path, "threat function", {"a": jnp.ones(2)})
+
+
+def test_every_flipped_byte_is_found(tmp_path):
+    like = {"a": jnp.ones(2)}
+    storage.save(tmp_path, "thing", like, {})
+    path = tmp_path / "arrays.npz"
+    good = path.read_bytes()
+    for i in range(0, len(good), 7):
+        path.write_bytes(good[:i] + bytes([good[i] ^ 1]) + good[i + 1 :])
+        with pytest.raises(StorageError, match=r"arrays\.npz: the checksum differs"):
+            storage.load(tmp_path, "thing", like)
+    path.write_bytes(good)
+    storage.load(tmp_path, "thing", like)
+
+
+@pytest.mark.parametrize("keep", [0, 1, -1])
+def test_a_cut_file_is_found(keep, tmp_path):
+    storage.save(tmp_path, "thing", {"a": jnp.ones(2)}, {})
+    path = tmp_path / "arrays.npz"
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(StorageError, match=r"arrays\.npz: \d+ bytes; the manifest says \d+"):
+        storage.load(tmp_path, "thing", {"a": jnp.ones(2)})
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "cannot be read"),
+        ("{", "cannot be read"),
+        ("[]", "format is not 1"),
+        ("null", "format is not 1"),
+        ('{"format": 2}', "format is not 1"),
+        ('{"format": 1}', "kind is None"),
+        ('{"format": 1, "kind": "thing"}', "'about' and 'arrays' must be tables"),
+        ('{"format": 1, "kind": "thing", "about": {}, "arrays": []}', "must be tables"),
+        ('{"format": 1, "kind": "thing", "about": {}, "arrays": {}}', "the manifest says None"),
+        (b"\xff\xfe", "cannot be read"),
+    ],
+)
+def test_a_damaged_manifest_is_named(text, message, tmp_path):
+    storage.save(tmp_path, "thing", {"a": jnp.ones(2)}, {})
+    (tmp_path / "manifest.json").write_bytes(text.encode() if isinstance(text, str) else text)
+    with pytest.raises(StorageError, match=message):
+        storage.load(tmp_path, "thing", {"a": jnp.ones(2)})
+
+
+def test_missing_files_are_named(tmp_path):
+    with pytest.raises(StorageError, match=r"no manifest\.json; it is not a saved thing"):
+        storage.load(tmp_path / "nowhere", "thing", {})
+    storage.save(tmp_path, "thing", {"a": jnp.ones(2)}, {})
+    (tmp_path / "arrays.npz").unlink()
+    with pytest.raises(StorageError, match=r"arrays\.npz: cannot be read"):
+        storage.load(tmp_path, "thing", {"a": jnp.ones(2)})
+    (tmp_path / "manifest.json").unlink()
+    (tmp_path / "manifest.json").mkdir()
+    with pytest.raises(StorageError, match=r"manifest\.json: cannot be read"):
+        storage.load(tmp_path, "thing", {"a": jnp.ones(2)})
+
+
+def test_a_failed_save_leaves_the_old_one_whole(tmp_path, monkeypatch):
+    storage.save(tmp_path, "thing", {"a": jnp.ones(2)}, {})
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", fail)
+        with pytest.raises(StorageError):
+            storage.save(tmp_path, "thing", {"a": jnp.zeros(2)}, {})
+    np.testing.assert_array_equal(storage.load(tmp_path, "thing", {"a": jnp.zeros(2)})["a"], 1)
+
+
+def test_a_save_broken_off_between_its_files_is_found(tmp_path, monkeypatch):
+    storage.save(tmp_path, "thing", {"a": jnp.ones(2)}, {})
+    with monkeypatch.context() as patch:
+        patch.setattr(storage, "write_json", fail)
+        with pytest.raises(OSError, match="No space"):
+            storage.save(tmp_path, "thing", {"a": jnp.zeros(2)}, {})
+    with pytest.raises(StorageError, match="checksum"):
+        storage.load(tmp_path, "thing", {"a": jnp.zeros(2)})
