@@ -8,7 +8,13 @@ import pytest
 
 from rp_jax.envs import circuit, jam
 from rp_jax.hazards import MovingObstacle, WallPoint, Window, reach
-from rp_jax.kinematics import Vehicle, make_vehicle, mirrored_actions, rotate
+from rp_jax.kinematics import (
+    Control,
+    Vehicle,
+    angle_of,
+    make_vehicle,
+    mirrored_actions,
+)
 
 KINDS = [(circuit, "wall"), (jam, "wall"), (jam, "obstacle")]
 NAMES = ["circuit-wall", "jam-wall", "jam-obstacle"]
@@ -104,6 +110,44 @@ def test_whatever_can_be_hit_within_the_horizon_lies_in_the_window(env, kind, x6
     assert features[:, 1].min() < 0.8 * window.lower[1]
 
 
+def steepest(turn, steps):
+    """Turns that bring a vehicle to a right angle as fast as it can, and no farther."""
+    swing = np.minimum(turn * np.arange(1, steps + 1), np.pi / 2)
+    return np.diff(swing, prepend=0.0)
+
+
+@each_kind
+@pytest.mark.parametrize("side", ["ahead", "behind", "left", "right"])
+def test_the_farthest_meeting_lies_just_inside_the_window(env, kind, side, x64):
+    sub = sub_of(env, kind)
+    model, source, steps = sub.agent, sub.source, sub.source.horizon
+    fast, slow = float(model.speeds[-1]), float(model.speeds[0])
+    most = float(np.abs(angle_of(model.actions.rotation)).max())
+    towards = {"ahead": (1, 0), "behind": (-1, 0), "left": (0, 1), "right": (0, -1)}[side]
+    towards = np.asarray(towards, float)
+    turns = np.zeros(steps) if towards[0] else towards[1] * steepest(most, steps)
+    rotation = jnp.asarray(np.stack([np.cos(turns), np.sin(turns)], axis=-1))
+    controls = Control(acceleration=jnp.zeros(steps), rotation=rotation)
+    agent = make_vehicle((0.0, 0.0), 0.0, slow if side == "behind" else fast)
+    last = path(agent, controls, model.step)[-1]
+    rim = source.radius if kind == "wall" else source.distance
+    place = last + (rim - 1e-9) * towards
+    if kind == "wall":
+        hazard = other = place
+    else:  # it comes straight at the agent
+        far = place + steps * source.speeds[-1] * towards
+        heading = np.arctan2(-towards[1], -towards[0])
+        hazard = make_vehicle(far, heading, source.speeds[-1])
+        other = hazard.replace(position=place)
+    assert source.hits(agent.replace(position=last), other)
+    relative = source.features(agent, hazard)[:2]
+    window = source.window
+    assert window.contains(relative)
+    # Turning faster than a right angle allows is the only slack.
+    limit = towards @ np.where(towards > 0, window.upper, window.lower)
+    assert 0.99 * limit < towards @ relative <= limit
+
+
 @each_kind
 def test_the_window_grows_with_the_horizon(env, kind):
     sub = sub_of(env, kind)
@@ -178,6 +222,12 @@ def test_state_of_inverts_features_of_any_pose(env, kind, x64):
     np.testing.assert_allclose(again, features, atol=1e-12)
 
 
+def test_state_of_makes_headings_of_any_length_unit_vectors():
+    source = sub_of(jam, "obstacle").source
+    _, other = source.state_of(jnp.asarray([0.1, 0.2, 1.5, -2.0, 0.02, 0.04]))
+    np.testing.assert_allclose(other.heading, [0.6, -0.8], atol=1e-6)
+
+
 def test_features_are_what_the_agent_sees_in_its_own_frame():
     agent = make_vehicle((1.0, 1.0), np.pi / 2, 0.04)
     wall, obstacle = (
@@ -237,17 +287,13 @@ def test_mirrored_obstacles_threaten_the_mirrored_actions_alike(monte_carlo):
     assert (np.abs(there.threat - here.threat) > 20 * error).any()
 
 
-@functools.partial(jax.jit, static_argnums=(0, 2))
-def states_of(env, params, count):
-    """Keys and states with the agent turned anywhere and at any speed."""
-    keys = jax.random.split(jax.random.key(7), count)
-    states = jax.vmap(env.reset, (0, None))(keys, params)
-    angle = jax.random.uniform(jax.random.key(8), (count,), float, -jnp.pi, jnp.pi)
-    heading = rotate(states.agent.heading, jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1))
-    low, high = params.agent.speeds[0], params.agent.speeds[-1]
-    speed = jax.random.uniform(jax.random.key(9), (count,), float, low, high)
-    agent = Vehicle(position=states.agent.position, heading=heading, speed=speed)
-    return keys, states.replace(agent=agent)
+def agents_of(model, places):
+    """Agents (90,) at random poses and speeds about the given places, and an action of each."""
+    rng = np.random.default_rng(7)
+    where = rng.choice(np.asarray(places), 90)
+    speed = rng.uniform(float(model.speeds[0]), float(model.speeds[-1]), 90)
+    agents = make_vehicle(where + rng.uniform(-0.05, 0.05, (90, 2)), rng.uniform(-3, 3, 90), speed)
+    return agents, jnp.arange(90) % 15
 
 
 def same_bits(a, b):
@@ -256,30 +302,42 @@ def same_bits(a, b):
 
 def test_the_agent_of_the_circuit_and_of_its_sub_rmdp_move_alike_to_the_bit():
     params = params_of(circuit, False)
-    keys, states = states_of(circuit, params, 90)
-    actions = jnp.arange(90) % 15
-    reached, _ = jax.jit(jax.vmap(circuit.step, (0, 0, 0, None)))(keys, states, actions, params)
     model = circuit.sub_rmdps(params)["wall"].agent
-    alone = jax.jit(jax.vmap(model.step))(states.agent, pick(model.actions, actions))
+    agents, actions = agents_of(model, params.track.centre)
+    zero = jnp.zeros(90, jnp.int32)
+    states = circuit.State(agent=agents, index=zero, time=zero)
+    step = jax.jit(jax.vmap(circuit.step, (None, 0, 0, None)))
+    reached, _ = step(jax.random.key(0), states, actions, params)
+    alone = jax.jit(jax.vmap(model.step))(agents, pick(model.actions, actions))
     same_bits(alone, reached.agent)
 
 
 def test_the_vehicles_of_the_jam_and_of_its_sub_rmdps_move_alike_to_the_bit():
     params = params_of(jam, False)
-    keys, states = states_of(jam, params, 90)
-    actions = jnp.arange(90) % 15
-    draws = jax.jit(jax.vmap(jam.draw, (0, 0, 0, None)))(keys, states, actions, params)
-    nowhere = jax.tree.map(lambda a: jnp.full_like(a, jnp.nan), draws.relocated)
-    transition = jax.jit(jax.vmap(jam.transition, (0, 0, 0, None)))
-    reached, _ = transition(states, actions, draws.replace(relocated=nowhere), params)
-
     subs = jam.sub_rmdps(params)
     model, source = subs["obstacle"].agent, subs["obstacle"].source
-    alone = jax.jit(jax.vmap(model.step))(states.agent, pick(model.actions, actions))
+    agents, actions = agents_of(model, [[0.5, 0.5], [1.5, 2.0], [2.6, 2.9]])
+    rng = np.random.default_rng(8)
+    place, turn = rng.uniform(0.1, 2.9, (90, 8, 2)), rng.uniform(-3, 3, (90, 8))
+    others = make_vehicle(place, turn, rng.uniform(0, 0.06, (90, 8)))
+    states = jam.State(
+        agent=agents,
+        obstacles=others,
+        present=jnp.ones((90, 8), bool),
+        progress=jnp.zeros(90),
+        time=jnp.zeros(90, jnp.int32),
+    )
+    controls = pick(source.behaviour.controls, rng.integers(15, size=(90, 8)))
+    nowhere = jax.tree.map(lambda a: jnp.full_like(a, jnp.nan), others)
+    draws = jam.Draws(controls=controls, relocated=nowhere)
+    transition = jax.jit(jax.vmap(jam.transition, (0, 0, 0, None)))
+    reached, _ = transition(states, actions, draws, params)
+
+    alone = jax.jit(jax.vmap(model.step))(agents, pick(model.actions, actions))
     same_bits(alone, reached.agent)
     same_bits(subs["wall"].agent, model)
     move = jax.jit(jax.vmap(jax.vmap(source.step, (0, None, 0))))
-    alone = move(states.obstacles, states.agent, draws.controls)
+    alone = move(others, agents, controls)
     stayed = ~np.isnan(np.asarray(reached.obstacles.speed))
     assert 0.5 < stayed.mean() < 1
     same_bits(pick(alone, stayed), pick(reached.obstacles, stayed))

@@ -1,5 +1,6 @@
 import re
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -30,6 +31,8 @@ def test_one_of_takes_any_iterable_such_as_the_keys_of_a_mapping():
         (1, {"most": 1}),
         (1e-300, {"above": 0}),
         (3, {"integer": True}),
+        (np.int64(3), {"integer": True, "least": 1}),
+        (np.float32(0.5), {"least": 0}),
         (float("inf"), {"infinite": True}),
         (float("inf"), {"infinite": True, "above": 0}),
     ],
@@ -46,6 +49,7 @@ def test_number_returns_a_value_within_the_rules(value, rules):
         (0, {"above": 0}, "a finite number, above 0"),
         (2, {"above": 2, "most": 3}, "a finite number, above 2, at most 3"),
         (2.5, {"integer": True}, "an integer"),
+        (2.0, {"integer": True}, "an integer"),  # shapes and counts must be of an integer type
         (0, {"integer": True, "least": 1, "most": 9}, "an integer, at least 1, at most 9"),
         (float("inf"), {}, "a finite number"),
         (float("-inf"), {"infinite": True, "least": 0}, "a number, at least 0"),

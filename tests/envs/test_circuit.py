@@ -8,14 +8,11 @@ from scipy import stats
 
 from rp_jax.envs import circuit
 from rp_jax.envs.tracks import TrackPlan
-from rp_jax.kinematics import Vehicle, angle_of, make_vehicle, to_ego
+from rp_jax.kinematics import Vehicle, angle_of, to_ego
 from rp_jax.sensing import FAR
 
-KEY = jax.random.key(0)
 COAST = 7  # neither acceleration nor turn
-step = jax.jit(jax.vmap(circuit.step, (None, 0, 0, None)))
-begin = jax.jit(jax.vmap(circuit.start_at, (0, None)))
-observe = jax.jit(jax.vmap(circuit.observe, (0, None)))
+ROWS = 320  # of every batch, so that all tests of a track share a compilation
 
 
 @functools.lru_cache
@@ -23,22 +20,45 @@ def params_of(track="default", fidelity="released"):
     return circuit.make_params(track, fidelity=fidelity)
 
 
+def at(positions, headings=0.0, speeds=0.0):
+    """Vehicles from numbers, without any computation on a device."""
+    positions = np.asarray(positions, np.float32)
+    full = lambda value: np.broadcast_to(np.float32(value), positions.shape[:-1])  # noqa: E731
+    angle = full(headings)
+    heading = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return Vehicle(position=positions, heading=heading, speed=full(speeds))
+
+
+@jax.jit
+def _drive(agents, actions, params):
+    states = jax.vmap(circuit.start_at, (0, None))(agents, params)
+    step = jax.vmap(circuit.step, (None, 0, 0, None))
+    reached, outcome = step(jax.random.key(0), states, actions, params)
+    seen = jax.vmap(circuit.observe, (0, None))(states, params)
+    return states, reached, outcome, seen
+
+
+def drive(agents, params, actions=COAST):
+    """(states, reached, outcome, observations of the states) of up to 320 agents."""
+    count = len(agents.speed)
+    pad = lambda a: np.concatenate([a, np.repeat(a[-1:], ROWS - count, axis=0)])  # noqa: E731
+    actions = np.broadcast_to(np.int32(actions), count)
+    done = jax.device_get(_drive(jax.tree.map(pad, agents), pad(actions), params))
+    return jax.tree.map(lambda a: a[:count], done)
+
+
 def coast(agents, params):
-    """(reached, outcome) of a batch of agents that neither brake nor turn."""
-    states = begin(agents, params)
-    return step(KEY, states, jnp.full(len(agents.speed), COAST), params)
+    """(reached, outcome) of agents that neither brake nor turn."""
+    return drive(agents, params)[1:3]
 
 
 def lap(params, backwards=False):
     """Agents (n / 4,) that each coast from a point of the centre line to the fourth after it."""
-    points = np.asarray(params.track.centre, np.float64)
+    points = np.asarray(params.track.centre)
     points = points[np.append(np.arange(0, len(points), 4), 0)]
     points = points[::-1] if backwards else points
     way = np.diff(points, axis=0)
-    length = np.linalg.norm(way, axis=-1)
-    real = lambda a: jnp.asarray(a, float)  # noqa: E731
-    heading = real(way / length[:, None])
-    return Vehicle(position=real(points[:-1]), heading=heading, speed=real(length))
+    return at(points[:-1], np.arctan2(way[:, 1], way[:, 0]), np.linalg.norm(way, axis=-1))
 
 
 @pytest.mark.parametrize("backwards", [False, True])
@@ -61,53 +81,41 @@ def test_a_lap_along_the_centre_line_earns_every_point_of_it_once(track, backwar
 @pytest.mark.parametrize(("fidelity", "expected"), [("released", 0.0), ("paper", 4.0)])
 def test_crossing_the_lap_line_counts_in_the_paper_only(fidelity, expected):
     params = params_of("circle", fidelity)
-    track = params.track
-    for start, sign in ((-2, 1.0), (2, -1.0)):
-        heading = sign * (track.centre[-start] - track.centre[start])
-        heading = sign * heading / jnp.linalg.norm(heading)
-        chord = 2 * 3.0 * np.sin(np.radians(2))
-        vehicle = Vehicle(
-            position=track.centre[start][None], heading=heading[None], speed=jnp.full(1, chord)
-        )
-        _, outcome = coast(vehicle, params)
-        np.testing.assert_allclose(outcome.reward, [sign * expected])
+    centre = np.asarray(params.track.centre)
+    # Four degrees of the circle at once, forwards and backwards.
+    first, last = centre[[-2, 2]], centre[[2, -2]]
+    way = last - first
+    agents = at(first, np.arctan2(way[:, 1], way[:, 0]), np.linalg.norm(way, axis=-1))
+    np.testing.assert_allclose(coast(agents, params)[1].reward, [expected, -expected])
 
 
-@pytest.mark.parametrize(("speed", "cost"), [(0.0, 1), (0.004, 1), (-0.004, 1), (0.006, 0)])
-def test_standing_still_costs_one(speed, cost):
+def test_standing_still_costs_one():
     params = params_of("circle")
-    place, ahead = params.track.centre[90], angle_of(params.track.direction[90])
-    agents = make_vehicle(place[None], ahead[None], jnp.full(1, speed))
-    reached, outcome = coast(agents, params)
-    np.testing.assert_array_equal(outcome.reward, [-cost])
-    assert reached.index == 90
+    place = np.repeat(np.asarray(params.track.centre)[90][None], 4, axis=0)
+    reached, outcome = coast(at(place, np.pi / 2, [0.0, 0.004, -0.004, 0.006]), params)
+    np.testing.assert_array_equal(outcome.reward, [-1, -1, -1, 0])
+    np.testing.assert_array_equal(reached.index, [90] * 4)
 
 
 def test_the_speed_that_counts_as_standing_is_that_after_the_step():
     params = params_of("circle")
-    agents = make_vehicle(params.track.centre[:2], [0.0, 0.0], [0.02, 0.0])
+    agents = at(np.zeros((2, 2)), 0.0, [0.02, 0.0])
     brake, speed_up = 2, 12
-    _, outcome = step(KEY, begin(agents, params), jnp.asarray([brake, speed_up]), params)
+    _, _, outcome, _ = drive(agents, params, [brake, speed_up])
     np.testing.assert_array_equal(outcome.reward, [-1, 0])
 
 
-def test_what_counts_as_standing_can_be_swept_by_vmap():
-    params = params_of("circle")
-    axes = jax.tree.map(lambda _: None, params).replace(stop_speed=0)
-    agents = make_vehicle(params.track.centre[0], 0.0, 0.04)
-    state = jax.jit(circuit.start_at)(agents, params)
-    sweep = jax.jit(jax.vmap(circuit.step, (None, None, None, axes)))
-    swept = params.replace(stop_speed=jnp.asarray([0.005, 0.05]))
-    _, outcome = sweep(KEY, state, jnp.asarray(COAST), swept)
-    np.testing.assert_array_equal(outcome.reward, [1, 0])
+def test_what_counts_as_standing_is_a_parameter():
+    params = params_of("circle").replace(stop_speed=jnp.asarray(0.05, float))
+    _, outcome = coast(at([[0.0, 0.0]] * 2, 0.0, [0.04, 0.06]), params)
+    np.testing.assert_array_equal(outcome.reward, [0, 1])  # a point passed, less 1 for the first
 
 
 def test_a_wall_nearer_than_the_radius_is_a_crash():
     params = params_of("circle")
     # Wall points stand at radius 3.3 around (0, 3).
-    x = jnp.asarray([3.19, 3.21, 3.3, 3.39, 3.41])
-    agents = make_vehicle(jnp.stack([x, jnp.full(5, 3.0)], axis=-1), jnp.zeros(5), jnp.zeros(5))
-    _, outcome = coast(agents, params)
+    places = [[x, 3.0] for x in (3.19, 3.21, 3.3, 3.39, 3.41)]
+    _, outcome = coast(at(places), params)
     np.testing.assert_array_equal(outcome.danger, [0, 1, 1, 1, 0])
     np.testing.assert_array_equal(outcome.terminated, [0, 1, 1, 1, 0])
     assert not outcome.goal.any()
@@ -116,9 +124,8 @@ def test_a_wall_nearer_than_the_radius_is_a_crash():
 def test_states_far_from_the_track_can_be_stepped_and_observed():
     params = params_of()
     rng = np.random.default_rng(0)
-    agents = make_vehicle(rng.uniform(-60, 60, (64, 2)), rng.uniform(-9, 9, 64), np.full(64, 7.0))
-    reached, outcome = coast(agents, params)
-    seen = observe(reached, params)
+    agents = at(rng.uniform(-60, 60, (64, 2)), rng.uniform(-9, 9, 64), 7.0)
+    _, reached, outcome, seen = drive(agents, params)
     assert np.isfinite(seen).all()
     assert np.isfinite(outcome.reward).all()
     assert ((reached.index >= 0) & (reached.index < 1253)).all()
@@ -135,8 +142,8 @@ def test_the_demonstration_starts_at_the_first_centre_point_along_the_track_at_r
 def test_episodes_start_anywhere_on_the_centre_line_within_45_degrees_of_it_at_rest():
     params = params_of()
     keys = jax.random.split(jax.random.key(1), 4000)
-    states = jax.jit(jax.vmap(circuit.reset, (0, None)))(keys, params)
-    track = params.track
+    states = jax.device_get(jax.jit(jax.vmap(circuit.reset, (0, None)))(keys, params))
+    track = jax.device_get(params.track)
     offset = states.agent.position - track.centre[states.index]
     assert np.abs(offset).max() < 0.02  # the nearest centre point, where two coincide
     angle = np.asarray(angle_of(to_ego(states.agent.heading, track.direction[states.index])))
@@ -146,14 +153,14 @@ def test_episodes_start_anywhere_on_the_centre_line_within_45_degrees_of_it_at_r
     assert stats.chisquare(counts).pvalue > 1e-4
     assert (states.agent.speed == 0).all()
     assert (states.time == 0).all()
-    np.testing.assert_allclose(jnp.linalg.norm(states.agent.heading, axis=-1), 1, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(states.agent.heading, axis=-1), 1, atol=1e-5)
 
 
 def test_the_observation_holds_the_scan_the_place_the_bend_and_the_speed():
     params = params_of("circle")
     i = 90  # at (3, 3), the track leads along +y; the heading is .2 to the right of it
-    agents = make_vehicle(params.track.centre[i][None], [np.pi / 2 - 0.2], [0.04])
-    seen = np.asarray(observe(begin(agents, params), params))[0]
+    agents = at(np.asarray(params.track.centre)[i][None], np.pi / 2 - 0.2, 0.04)
+    seen = drive(agents, params)[3][0]
     np.testing.assert_allclose(seen[360:362], [3, 3], atol=1e-5)
     onward = np.radians(90.5) - (np.pi / 2 - 0.2)
     np.testing.assert_allclose(seen[362:], [onward, 0.04], atol=1e-4)
@@ -166,8 +173,8 @@ def test_the_observation_holds_the_scan_the_place_the_bend_and_the_speed():
 
 def test_the_bend_stays_within_half_a_turn():
     params = params_of("circle")
-    agents = make_vehicle(params.track.centre[:360:5], np.linspace(-3, 3, 72), np.zeros(72))
-    seen = observe(begin(agents, params), params)
+    agents = at(np.asarray(params.track.centre)[::5], np.linspace(-3, 3, 72))
+    seen = drive(agents, params)[3]
     assert np.abs(seen[:, 362]).max() <= np.pi + 1e-6
 
 
@@ -176,15 +183,15 @@ def test_every_wall_point_within_the_threats_window_is_a_hazard():
     track, window = jax.device_get((params.track, params.wall.window))
     rng = np.random.default_rng(2)
     where = track.centre[rng.integers(1253, size=200)] + rng.uniform(-0.2, 0.2, (200, 2))
-    agents = make_vehicle(where, rng.uniform(-3, 3, 200), np.zeros(200))
-    states = begin(agents, params)
+    agents = at(where, rng.uniform(-3, 3, 200))
+    states = drive(agents, params)[0]
     hazards = jax.jit(jax.vmap(circuit.hazards, (0, None)))(states, params)["wall"]
     points, present = jax.device_get(hazards)
     np.testing.assert_array_equal(present, points[..., 0] < FAR)
 
     def inside(points):
-        offset = points - np.asarray(agents.position)[:, None]
-        c, s = np.asarray(agents.heading).T[..., None]
+        offset = points - agents.position[:, None]
+        c, s = agents.heading.T[..., None]
         x, y = offset[..., 0] * c + offset[..., 1] * s, offset[..., 1] * c - offset[..., 0] * s
         return window.contains(np.stack([x, y], axis=-1))
 

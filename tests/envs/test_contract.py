@@ -48,8 +48,11 @@ def play(env, row_keys, params):
         seen |= {"keys": data, "before": states, "action": action}
         return carried, seen | {"reached": reached, "outcome": outcome, "carried": carried}
 
-    starts = jax.vmap(env.reset, (0, None))(row_keys, params)
-    return jax.lax.scan(step, starts, jnp.arange(STEPS))[1]
+    # They begin at the limit, so that the first thing to happen is a fresh start.
+    shapes = jax.eval_shape(env.reset, row_keys[0], params)
+    blank = jax.tree.map(lambda a: jnp.zeros((len(row_keys), *a.shape), a.dtype), shapes)
+    blank = blank.replace(time=blank.time + LIMIT - 1)
+    return jax.lax.scan(step, blank, jnp.arange(STEPS))[1]
 
 
 jitted_play = jax.jit(play, static_argnums=0)
@@ -71,14 +74,24 @@ def replay(name, row_keys):
 
 @functools.lru_cache
 def stepper(name):
-    """A jitted, vmapped step, and a list that grows whenever it is traced."""
-    env, traced = made(name)[0], []
+    """A jitted step of a batch, and a list that grows whenever it is traced.
 
-    def step(key, state, action, params):
+    It takes a time limit for every row, which sweeps this parameter.
+    """
+    (env, params), traced = made(name), []
+    axes = jax.tree.map(lambda _: None, params).replace(time_limit=0)
+
+    @jax.jit
+    def run(keys, states, actions, params, limits):
         traced.append(name)
-        return env.step(key, state, action, params)
+        swept = params.replace(time_limit=limits)
+        return jax.vmap(env.step, (0, 0, 0, axes))(keys, states, actions, swept)
 
-    return jax.jit(jax.vmap(step, (0, 0, 0, None))), traced
+    def step(keys, states, actions, params=params, limits=LIMIT):
+        limits = np.broadcast_to(np.int32(limits), ROWS)
+        return jax.device_get(run(keys, states, actions, params, limits))
+
+    return step, traced
 
 
 def same_bits(a, b):
@@ -123,7 +136,7 @@ def test_a_step_keeps_structure_shapes_and_types_of_the_state(name):
     assert described(again) == described(state)
 
 
-@every_env
+@every_module
 def test_everything_is_double_when_double_precision_is_on(name, x64):
     env, make = ENVS[name]
     params = make()
@@ -180,7 +193,7 @@ def test_danger_is_one_exactly_where_some_hazard_is_hit_and_ends_the_episode(nam
     assert (outcome.terminated | ~outcome.goal).all()
 
 
-@every_env
+@every_module
 def test_causes_are_hazards_that_are_present_and_hit(name):
     env, params = made(name)
     rows = played(name)
@@ -217,13 +230,13 @@ def test_a_step_can_start_from_any_state_and_has_no_memory(name):
     times = np.asarray([0, 3, LIMIT - 2, LIMIT - 1, LIMIT, 99, 0], np.int32)
     mixed = mixed.replace(agent=agents, time=times)
     action = np.arange(7, dtype=np.int32) % env.num_actions(params)
-    reached, outcome = step(keys_of(2), mixed, action, params)
+    reached, outcome = step(keys_of(2), mixed, action)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((reached, outcome)))
     np.testing.assert_array_equal(reached.time, mixed.time + 1)
     np.testing.assert_array_equal(outcome.done[3:6], [True] * 3)
     # Whatever happened in between, the same state is left in the same way.
-    step(keys_of(3), row(rows["before"], 0), action, params)
-    same_bits(step(keys_of(2), mixed, action, params), (reached, outcome))
+    step(keys_of(3), row(rows["before"], 0), action)
+    same_bits(step(keys_of(2), mixed, action), (reached, outcome))
 
 
 @every_env
@@ -242,47 +255,30 @@ def test_after_an_end_a_fresh_start_is_carried_and_otherwise_the_state_reached(n
 
 @every_env
 def test_the_state_reached_is_that_of_the_step_even_where_it_is_terminal(name):
-    params, rows, (step, _) = made(name)[1], played(name), stepper(name)
+    rows, (step, _) = played(name), stepper(name)
     terminated = rows["outcome"].terminated
     t = int(np.argmax(terminated.sum(axis=1)))
     assert terminated[t].any()
     at = {part: row(rows[part], t) for part in ("keys", "before", "action", "reached", "outcome")}
     keys = jax.vmap(jax.random.split)(jax.random.wrap_key_data(at["keys"]))[:, 0]
-    expected = step(keys, at["before"], at["action"], params)
+    expected = step(keys, at["before"], at["action"])
     close = functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-5)
     jax.tree.map(close, (at["reached"], at["outcome"]), expected)
     assert (at["reached"].time[terminated[t]] > 0).all()
 
 
 @every_env
-def test_other_values_of_the_parameters_need_no_other_compilation(name):
-    params, rows, (step, traced) = made(name)[1], played(name), stepper(name)
-    args = keys_of(4), row(rows["before"], 10), np.zeros(ROWS, np.int32)
-    step(*args, params)
-    before = len(traced)
-    for limit in (3, 30):
-        _, outcome = step(*args, params.replace(time_limit=jnp.asarray(limit, jnp.int32)))
-        time = args[1].time + 1
-        np.testing.assert_array_equal(outcome.truncated, (time >= limit) & ~outcome.terminated)
-    step(*args, params.replace(beta=jnp.float32(0.5)))
-    assert len(traced) == before <= 1
-
-
-@every_module
-def test_parameters_can_be_swept_by_vmap(name):
-    env, params = made(name)
-    before, (step, _) = row(played(name)["before"], 10), stepper(name)
-    limits = jnp.asarray([2, 11, 1000], jnp.int32)
-    axes = jax.tree.map(lambda _: None, params).replace(time_limit=0)
-    sweep = jax.jit(jax.vmap(jax.vmap(env.step, (0, 0, 0, None)), (None, None, None, axes)))
+def test_a_parameter_can_be_swept_by_vmap_and_others_changed_without_compiling_again(name):
+    before, (step, traced) = row(played(name)["before"], 10), stepper(name)
     args = keys_of(4), before, np.zeros(ROWS, np.int32)
-    _, outcome = sweep(*args, params.replace(time_limit=limits))
-    assert outcome.truncated.shape == (3, ROWS)
-    assert len(np.unique(outcome.truncated.sum(axis=1))) > 1
-    for i, limit in enumerate(limits):
-        _, expected = step(*args, params.replace(time_limit=limit))
-        np.testing.assert_array_equal(outcome.truncated[i], expected.truncated)
-        np.testing.assert_allclose(outcome.reward[i], expected.reward, atol=1e-5)
+    limits = np.asarray([1, 10, 11, 12, LIMIT, LIMIT + 1, 1000], np.int32)
+    reached, outcome = step(*args, limits=limits)
+    np.testing.assert_array_equal(outcome.truncated, (reached.time >= limits) & ~outcome.terminated)
+    assert outcome.truncated.any()
+    assert not outcome.truncated.all()
+    params = made(name)[1]
+    step(*args, params.replace(beta=jnp.float32(0.5)), limits[::-1])
+    assert len(traced) == 1
 
 
 @given(hnp.arrays(bool, 13), st.sampled_from([1, 4, 40]))
@@ -331,6 +327,53 @@ def test_renew_keeps_the_rows_of_any_pytree_with_typed_keys():
     renewed = base.renew(where, (keys,), lambda i: (others.at[i].get(mode="clip"),), 2)
     expected = np.where(where[:, None], jax.random.key_data(others), jax.random.key_data(keys))
     np.testing.assert_array_equal(jax.random.key_data(renewed[0]), expected)
+
+
+class Toy:
+    """Counts to `state["last"]`, which every start draws anew."""
+
+    @staticmethod
+    def reset(key, params):
+        last = jax.random.randint(key, (), 1, params)
+        return {"last": last, "time": jnp.asarray(0, jnp.int32)}
+
+    @staticmethod
+    def step(key, state, action, params):
+        time = state["time"] + 1
+        no = jnp.asarray(False)
+        ended = time >= state["last"]
+        outcome = base.Outcome(
+            reward=action + 0.0, danger=jnp.zeros(()), terminated=ended, truncated=no, goal=no
+        )
+        return {"last": state["last"], "time": time}, outcome
+
+
+def test_what_is_seen_belongs_to_the_states_and_starts_are_looked_at_only_where_needed():
+    keys = jax.random.split(jax.random.key(0), 40)
+    last = jnp.arange(40, dtype=jnp.int32) % 4 + 1
+    states = {"last": last, "time": jnp.ones(40, jnp.int32)}
+    looked = []
+
+    def look(states):
+        looked.append(len(states["time"]))
+        return 1000 * states["last"] + states["time"]
+
+    @jax.jit
+    def advance(keys, states):
+        args = Toy, keys, states, jnp.zeros(40, int), 1000
+        return base.step_and_renew(*args, look), base.auto_reset_step(*args)
+
+    (carried, reached, outcome), unseen = advance(keys, states)
+    same_bits(unseen, (carried[0], reached[0], outcome))
+    np.testing.assert_array_equal(outcome.done, last <= 2)
+    assert set(looked) == {40, 16}  # at all that were reached, and at starts by the chunk
+    np.testing.assert_array_equal(reached[0]["time"], np.full(40, 2))
+    np.testing.assert_array_equal(reached[0]["last"], last)
+    np.testing.assert_array_equal(carried[0]["time"], np.where(outcome.done, 0, 2))
+    fresh = carried[0]["last"][outcome.done]
+    assert len(np.unique(fresh)) > 15
+    for states, seen in (carried, reached):
+        np.testing.assert_array_equal(seen, 1000 * states["last"] + states["time"])
 
 
 def test_the_time_limit_never_hides_a_true_end():

@@ -27,6 +27,13 @@ def oval(straight=2.0, radius=1.0, half_width=0.3, side=1):
     return plan
 
 
+def rounded_square(radius):
+    plan = TrackPlan().straight(1.0)
+    for _ in range(3):
+        plan = plan.curve(radius, 90).straight(2.0)
+    return plan.curve(radius, 90).straight(1.0)
+
+
 def made(plan):
     return jax.device_get(make_track(plan, RADIUS, REACH))
 
@@ -210,6 +217,10 @@ def test_a_piece_that_cannot_be_drawn_names_the_field_and_the_value(draw, messag
             r"^track: it crosses itself: .* are 0\.5\d* apart; at least 0\.60",
         ),
         (default_plan().widened(0.6), "^track: it crosses itself"),
+        (
+            rounded_square(0.05),
+            r"^track: at centre point \d+ \[.*\] a wall is 0\.05\d away; .* farther than .* 0\.1",
+        ),
     ],
 )
 def test_a_plan_that_is_no_track_says_where_and_why(plan, message):

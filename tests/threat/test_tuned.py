@@ -3,25 +3,15 @@
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 import pytest
 
-from experiments import recipes
+from experiments import recipes, truth
 from rp_jax.envs import circuit, jam
-from rp_jax.threat import build, report
+from rp_jax.threat import build
 
 DATA = Path(__file__).parents[1] / "data"
 # Mean absolute error, and unsafe pairs called safe, of the released networks on these states.
 RELEASED = {"circuit_wall": (0.0100, 0.022), "jam_wall": (0.0139, 0.031), "jam_car": (0.0066, 0.0)}
-
-
-def features_of(states):
-    """Features of recorded states (x, y, [relative heading, other speed,] own speed)."""
-    if states.shape[1] == 3:
-        return jnp.asarray(states, jnp.float32)
-    x, y, turn, other, own = states.T
-    return jnp.asarray(np.stack([x, y, np.cos(turn), np.sin(turn), other, own], 1), jnp.float32)
 
 
 @pytest.mark.slow
@@ -32,15 +22,11 @@ def test_tuned_models_beat_the_released_ones(name):
     settings = recipes.TUNED_OBSTACLE if kind == "obstacle" else recipes.TUNED_WALL
     sub = env.sub_rmdps(env.make_params())[kind]
     model = build.build(jax.random.key(0), sub, settings, x).model
-    truth = np.load(DATA / f"threat_truth_{name}.npz")
-    said = np.asarray(report.predict(model, features_of(truth["states"])))
-    found = report.compare(said, truth["truth"], x)
+    found = truth.compare(model, DATA / f"threat_truth_{name}.npz", x)
     error, missed = RELEASED[name]
-    assert found["mae"] < error
-    assert found["unsafe_called_safe"] <= missed
+    assert found["window"]["mae"] < error
+    assert found["window"]["unsafe_called_safe"] <= missed
     if name == "jam_car":
-        near = np.asarray(report.predict(model, features_of(truth["states_near"])))
-        found = report.compare(near, truth["truth_near"], x)
-        assert found["mae"] < 0.029
+        assert found["near"]["mae"] < 0.029
         # One of the 160 truly unsafe pairs may pass, at a threat of hardly more than x.
-        assert found["unsafe_called_safe"] <= 1.5 / 160
+        assert found["near"]["unsafe_called_safe"] <= 1.5 / 160

@@ -1,0 +1,79 @@
+"""A saved threat function against recorded exact (or 2-million-path) threats of single hazards.
+
+python -m experiments.truth --env jam --threat results/RUN/threat
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jax import Array
+
+from experiments import circuit, cli, jam, pipeline, tables
+from rp_jax import storage
+from rp_jax.threat import artefact, report
+from rp_jax.threat.model import ThreatModel
+from rp_jax.validate import one_of
+
+EXPERIMENTS: dict[str, Any] = {"circuit": circuit, "jam": jam}
+RECORDED = {"wall": "wall", "obstacle": "car"}  # kinds of hazard as the files call them
+
+
+@dataclass(frozen=True)
+class Config:
+    """What is compared."""
+
+    env: str  # circuit or jam
+    threat: Path  # folder of the threat function
+    data: Path = Path("tests/data")  # folder of the recorded threats
+    out: Path | None = None  # JSON file for the rows
+
+
+def features_of(states: np.ndarray) -> Array:
+    """(n, F) features of recorded states (x, y, [relative heading, other speed,] own speed)."""
+    if states.shape[1] == 3:
+        return jnp.asarray(states, jnp.float32)
+    x, y, turn, other, own = states.T
+    columns = [x, y, np.cos(turn), np.sin(turn), other, own]
+    return jnp.asarray(np.stack(columns, axis=-1), jnp.float32)
+
+
+def compare(model: ThreatModel, recorded: Path, x: float) -> dict[str, dict[str, float]]:
+    """Errors on each set of states in a file of recorded threats; sets end alike, as in `_near`."""
+    with np.load(recorded) as file:
+        data = dict(file)
+    found = {}
+    for name in ("states", "states_near"):
+        if name in data:
+            said = np.asarray(report.predict(model, features_of(data[name])))
+            true = data[name.replace("states", "truth")]
+            found[name.removeprefix("states").strip("_") or "window"] = report.compare(
+                said, true, x
+            )
+    return found
+
+
+def run(config: Config) -> list[dict[str, Any]]:
+    """One row per hazard and set of states."""
+    module = EXPERIMENTS[one_of("env", config.env, EXPERIMENTS)]
+    settings = module.quick("tuned")
+    task: pipeline.Task = module.make_task(settings)
+    models = artefact.load(config.threat, config.env, task.env.sub_rmdps(task.train))
+    rows = []
+    for kind, model in models.items():
+        path = config.data / f"threat_truth_{config.env}_{RECORDED[kind]}.npz"
+        for name, found in compare(model, path, settings.x).items():
+            rows.append({"hazard": kind, "of": name, **found})
+    tables.show_threats(rows, settings.x)
+    return rows
+
+
+if __name__ == "__main__":
+    chosen = tyro.cli(Config, description=__doc__)
+    with cli.bad_input():
+        found = run(chosen)
+        if chosen.out is not None:
+            storage.write_json(chosen.out, found)

@@ -1,0 +1,272 @@
+import csv
+import json
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from experiments import circuit, cli, jam, pipeline, tables
+from rp_jax import storage
+from rp_jax.planning import loop
+from rp_jax.threat import artefact
+
+MODULES = {"circuit": circuit, "jam": jam}
+PROMISED = [
+    *("env", "variant", "method", "seed", "episodes", "return_mean", "return_ci95"),
+    *("uncrashed_return_mean", "crashes", "crash_rate", "crash_upper95", "goal_rate"),
+    *("interventions", "insecure", "seconds_per_100_actions", "train_seconds"),
+]
+TINY_FIT = "--{0}.fit.steps 40 --{0}.fit.batch 64 --{0}.fit.hidden 16"
+TINY_THREAT = "--{0}.states 200 --{0}.paths 4 --{0}.test-states 200 --{0}.test-paths 8 " + TINY_FIT
+TINY = (
+    "--planning.steps 480 --planning.num-envs 8 --planning.batch 32 --planning.replay 512 "
+    "--planning.replay-start 64 --planning.n-step 2 --episodes 16 --seeds 2 --x 0.9"
+)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compile_soon():
+    """Programs that run for a moment need no optimising; flashbax needs rank promotion."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    with jax.numpy_rank_promotion("allow"):
+        yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+def go(name, out, *options):
+    module = MODULES[name]
+    kinds = ["wall", "obstacle"] if name == "jam" else ["wall"]
+    argv = " ".join([TINY, *(TINY_THREAT.format(kind) for kind in kinds), *options]).split()
+    argv += ["--out", str(out)]
+    main = (f"experiments.{name}", module.__doc__, module.PRESETS, module.make_task, argv)
+    assert cli.main(*main) == out
+    return out
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A whole run of Circuit, two seeds, without figures."""
+    out = tmp_path_factory.mktemp("results") / "circuit"
+    return go("circuit", out, "--no-figures --track circle --test-tracks circle")
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """A whole run of Jam, with figures."""
+    out = tmp_path_factory.mktemp("results") / "jam"
+    return go("jam", out, "--obstacles 3 --test-obstacles 3")
+
+
+def read(path):
+    return json.loads(path.read_text(), parse_constant=lambda name: pytest.fail(name))
+
+
+def lines(path):
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def names(folder):
+    return {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+
+
+FILES = {
+    *("config.json", "metrics.jsonl", "table.json", "table.csv", "summary.json", "training.json"),
+    *("agent/arrays.npz", "agent/manifest.json", "threat/arrays.npz", "threat/manifest.json"),
+    *("threat/report.json", "threat/curves.json"),
+}
+
+
+def test_a_run_leaves_all_its_files_and_no_others(finished):
+    assert names(finished) == FILES
+
+
+def check_table(folder, variants, seeds):
+    rows = read(folder / "table.json")
+    assert [(row["variant"], row["seed"]) for row in rows] == [
+        (variant, seed) for variant in variants for seed in seeds
+    ]
+    for row in rows:
+        assert set(PROMISED) <= set(row)
+        assert row["episodes"] == 16
+        assert row["crash_rate"] == row["crashes"] / 16 <= row["crash_upper95"]
+        assert 0 <= row["interventions"] <= 1
+        assert row["seconds_per_100_actions"] > 0
+        assert row["train_seconds"] > 0
+        assert sum(row["causes"].values()) >= row["crashes"]
+    with (folder / "table.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert list(table[0]) == PROMISED
+    for shown, row in zip(table, rows, strict=True):
+        for name in ("variant", "method"):
+            assert shown[name] == row[name]
+        for name in ("seed", "episodes", "return_mean", "crashes", "crash_upper95"):
+            assert float(shown[name]) == row[name]
+    return rows
+
+
+def test_the_table_has_a_row_per_variant_and_seed(finished):
+    rows = check_table(finished, ["circle"], [0, 1])
+    assert {row["method"] for row in rows} == {"RP (x=0.9)"}
+    assert {row["env"] for row in rows} == {"circuit"}
+
+
+def check_training(folder, warm, envs):
+    training, history = read(folder / "training.json"), lines(folder / "metrics.jsonl")
+    assert training["inadmissible"] == 0
+    assert sum(row["inadmissible"] for row in history) == 0
+    assert training["crashes"] == sum(row["crashes"] for row in history)
+    assert training["episodes"] == sum(row["episodes"] for row in history)
+    for seed in (0, 1):
+        steps = [row["steps"] for row in history if row["seed"] == seed]
+        assert steps == sorted(set(steps))
+        assert steps[-1] * 2 == training["steps"]
+        assert steps[-1] >= 480
+    assert all(np.isfinite(row["loss"]) for row in history)
+    assert set(training["seconds"]) >= {"reconnaissance", "planning", "planning_compilation"}
+
+
+def test_training_is_accounted_for(finished):
+    check_training(finished, 64, 8)
+
+
+def test_the_settings_are_kept(finished):
+    config = read(finished / "config.json")
+    assert (config["task"], config["preset"]) == ("circuit", "quick")
+    assert (config["x"], config["seeds"], config["track"]) == (0.9, 2, "circle")
+    assert config["planning"]["num_envs"] == 8
+    assert config["wall"]["fit"]["hidden"] == [16]
+    assert set(config["versions"]) == {"rp_jax", "jax"}
+
+
+def check_agents(folder, name):
+    module = MODULES[name]
+    config = module.quick("tuned")
+    task = module.make_task(config)
+    pmdp = pipeline.make_pmdp(task, config, {}, task.train)
+    network = loop.make_network(config.planning, pmdp)
+
+    def example(key):
+        states = jax.vmap(task.env.reset, (0, None))(jax.random.split(key, 1), task.train)
+        return network.init(key, pmdp.perceive(states).encoded)
+
+    shapes = jax.eval_shape(jax.vmap(example), jax.random.split(jax.random.key(0), 2))
+    like = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), shapes)
+    weights = storage.load(folder / "agent", "Q-network", like)
+    for leaf in jax.tree.leaves(weights):
+        assert np.isfinite(leaf).all()
+    kernels = [leaf for leaf in jax.tree.leaves(weights) if leaf.ndim == 3]
+    assert all((kernel[0] != kernel[1]).any() for kernel in kernels)  # the seeds differ
+
+
+def test_the_agents_of_all_seeds_are_saved(finished):
+    check_agents(finished, "circuit")
+
+
+def test_the_threat_function_has_its_report(finished):
+    rows = read(finished / "threat" / "report.json")
+    assert [(row["hazard"], row["of"]) for row in rows] == [("wall", "one"), ("wall", "sum")]
+    about = storage.read_manifest(finished / "threat", artefact.KIND)["about"]
+    assert (about["environment"], about["x"], about["seed"]) == ("circuit", 0.9, 0)
+    assert about["networks"]["wall"]["hidden"] == [16]
+    curves = read(finished / "threat" / "curves.json")
+    assert curves["wall"][-1]["step"] == 40
+
+
+def test_a_saved_threat_function_serves_another_track_and_threshold(finished, tmp_path):
+    config = circuit.Config(threat=finished / "threat", track="narrowed", x=0.1)
+    task = circuit.make_task(config)
+    models, curves, seconds = pipeline.learn_threats(task, config, tmp_path)
+    assert curves == seconds == {}
+    assert list(tmp_path.iterdir()) == []  # it is not saved again
+    saved = np.load(finished / "threat" / "arrays.npz")
+    for name, array in storage.leaves({"wall": {"model": models["wall"]}}).items():
+        np.testing.assert_array_equal(array, saved[name])
+
+
+def test_without_a_shield_no_threat_is_learned(tmp_path):
+    config = circuit.Config(x=float("inf"))
+    assert pipeline.learn_threats(circuit.make_task(config), config, tmp_path) == ({}, {}, {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_two_uses_of_seeds_share_a_key():
+    streams = (
+        *(pipeline.THREAT, pipeline.SUMS, pipeline.PLANNING),
+        *(pipeline.EVALUATION, pipeline.STARTS, pipeline.MEDIA),
+    )
+    data = [
+        tuple(np.asarray(jax.random.key_data(pipeline.key_of(seed, stream))).tolist())
+        for seed in range(20)
+        for stream in streams
+    ]
+    assert len(set(data)) == 20 * len(streams)
+
+
+def test_methods_are_named_by_what_sets_them_apart():
+    name = lambda **changes: pipeline.method_name(circuit.Config(**changes))  # noqa: E731
+    assert name(x=0.001) == "RP (x=0.001)"
+    assert name(x=0.001, learning_penalty=5.0) == "RP (x=0.001, 5)"
+    assert name(x=float("inf"), learning_penalty=50.0) == "DQN (penalty 50)"
+
+
+def test_seeds_are_summed_up_by_hand():
+    row = {"variant": "a", "seed": 0, "episodes": 10, "crashes": 1, "return_mean": 1.0}
+    rows = [row, {**row, "seed": 1, "return_mean": 3.0, "crashes": 0}, {**row, "variant": "b"}]
+    both, single = tables.over_seeds(rows)
+    assert (both["variant"], both["seeds"]) == ("a", 2)
+    assert both["return_mean"] == 2.0
+    assert both["return_ci95"] == pytest.approx(12.7062, rel=1e-4)  # t(.975, 1) x 1
+    assert (both["crashes"], both["episodes"], both["crash_rate"]) == (1, 20, 0.05)
+    assert both["crash_ci95"][0] < 0.05 < both["crash_upper95"] < both["crash_ci95"][1]
+    assert (single["variant"], single["seeds"]) == ("b", 1)
+    assert np.isnan(single["return_ci95"])
+
+
+@pytest.mark.slow
+def test_a_run_of_jam_leaves_figures_and_an_animation(drawn):
+    figures = {
+        *("learning_curves.png", "threat_fit.png", "trajectories.png", "threat_of_all.png"),
+        *("threat_of_one_obstacle.png", "threat_of_one_wall_point.png"),
+    }
+    assert names(drawn) == FILES | {f"figures/{name}" for name in figures} | {"animation.gif"}
+    for name in figures:
+        assert (drawn / "figures" / name).read_bytes().startswith(b"\x89PNG")
+    assert (drawn / "animation.gif").read_bytes().startswith(b"GIF8")
+    check_table(drawn, ["N=3"], [0, 1])
+    check_training(drawn, 64, 8)
+    check_agents(drawn, "jam")
+    rows = read(drawn / "threat" / "report.json")
+    assert [row["hazard"] for row in rows] == ["obstacle", "wall"] * 2
+
+
+@pytest.mark.slow
+def test_its_threat_function_serves_other_thresholds_and_counts(drawn, tmp_path):
+    again = f"--no-figures --threat {drawn / 'threat'} --x 0.5 --obstacles 2 --test-obstacles 1 4"
+    folder = go("jam", tmp_path / "again", again)
+    assert names(folder) == {name for name in FILES if not name.startswith("threat/")}
+    rows = check_table(folder, ["N=1", "N=4"], [0, 1])
+    assert {row["method"] for row in rows} == {"RP (x=0.5)"}
+    assert read(folder / "training.json")["inadmissible"] == 0
+    assert read(folder / "config.json")["threat"] == str(drawn / "threat")
+
+
+@pytest.mark.slow
+def test_a_run_without_a_shield_trains_and_evaluates(tmp_path):
+    options = "--no-figures --x inf --learning-penalty 200 --track circle --test-tracks circle"
+    folder = go("circuit", tmp_path / "dqn", options)
+    assert names(folder) == {name for name in FILES if not name.startswith("threat/")}
+    rows = check_table(folder, ["circle"], [0, 1])
+    assert {row["method"] for row in rows} == {"DQN (penalty 200)"}
+    assert all(row["interventions"] == row["insecure"] == 0 for row in rows)
+    assert read(folder / "config.json")["x"] == "inf"
+
+
+def test_a_task_can_be_run_as_a_module(tmp_path):
+    command = [sys.executable, "-m", "experiments.jam", "--x", "nan", "--out", str(tmp_path / "o")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "x is nan" in done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "o").exists()
