@@ -42,7 +42,7 @@ def run(batch: int = 1024) -> list[Row]:
         key = jax.random.key(0)
         states = jax.vmap(env.reset, (0, None))(jax.random.split(key, batch), params)
         for observed in (False, True):
-            title = f"{name}, {'with' if observed else 'without'} observation"
+            title = f"{name}, observed" if observed else name
             program = steps(env, observed)
             rows.append(measure(title, "steps", batch, batch * STEPS, program, states, key, params))
     return rows

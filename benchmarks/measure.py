@@ -85,15 +85,23 @@ def machine() -> dict[str, Any]:
     }
 
 
+def _short(number: float) -> str:
+    """Three digits and k, M or G."""
+    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
+        if number >= size:
+            return f"{number / size:.3g}{unit}"
+    return f"{number:.3g}"
+
+
 def report(name: str, rows: Sequence[Row], out: Path | None) -> None:
     """Prints the rows, and writes them as JSON if `out` is given."""
+    same = len({row.unit for row in rows}) == 1
     shown = [
         {
-            "what": row.name,
+            "what": row.name if same else f"{row.name} ({row.unit})",
             "batch": row.batch,
-            "per second": (f"{row.per_second:,.0f}"),
-            "unit": row.unit,
-            "slowest .. fastest": f"{row.slowest:,.0f} .. {row.fastest:,.0f}",
+            f"{row.unit} / s" if same else "per second": _short(row.per_second),
+            "spread": f"{_short(row.slowest)} .. {_short(row.fastest)}",
             "compile s": f"{row.compile_seconds:.2f}",
             "peak MiB": f"{row.peak_mib:,.0f}",
         }

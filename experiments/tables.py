@@ -101,7 +101,7 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
-def show_threats(rows: Sequence[Mapping[str, Any]], x: float) -> None:
+def show_threats(rows: Sequence[Mapping[str, Any]], x: float, truth: str = "fresh labels") -> None:
     """What the threat models' reports say, on the terminal."""
     shown = [
         {
@@ -113,4 +113,4 @@ def show_threats(rows: Sequence[Mapping[str, Any]], x: float) -> None:
         }
         for row in rows
     ]
-    console.table(f"threat models against fresh labels (x = {x:g})", shown, list(shown[0]))
+    console.table(f"threat models against {truth} (x = {x:g})", shown, list(shown[0]))

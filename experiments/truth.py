@@ -67,7 +67,7 @@ def run(config: Config) -> list[dict[str, Any]]:
         path = config.data / f"threat_truth_{config.env}_{RECORDED[kind]}.npz"
         for name, found in compare(model, path, settings.x).items():
             rows.append({"hazard": kind, "of": name, **found})
-    tables.show_threats(rows, settings.x)
+    tables.show_threats(rows, settings.x, "recorded threats")
     return rows
 
 

@@ -10,7 +10,7 @@ from rp_jax.recon.labels import exact_threat, monte_carlo_threat
 PATHS = 4096
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
-settings.register_profile("rp_jax", deadline=None, derandomize=True, database=None, max_examples=50)
+settings.register_profile("rp_jax", deadline=None, derandomize=True, database=None, max_examples=30)
 settings.load_profile("rp_jax")
 
 

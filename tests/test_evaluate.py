@@ -63,7 +63,9 @@ def by_hand(key, pmdp, values, episodes, batch):
     look, hit = jax.jit(pmdp.perceive), jax.jit(env.causes)
     for round_key in jax.random.split(key, -(-episodes // batch)):
         start_key, step_key = jax.random.split(round_key)
-        for begin, onward in zip(*(jax.random.split(k, batch) for k in (start_key, step_key)), strict=True):
+        for begin, onward in zip(
+            *(jax.random.split(k, batch) for k in (start_key, step_key)), strict=True
+        ):
             state = reset(begin, pmdp.params)
             row = dict.fromkeys(("score", "danger", "length", "interventions", "insecure"), 0.0)
             done = False
@@ -147,7 +149,15 @@ def made(score, danger, goal, length, interventions, insecure, pit):
 
 
 def test_the_summary_by_hand():
-    rows = made([1, 2, 3, 10], [0, 1, 0, 0], [1, 0, 0, 1], [5, 5, 6, 4], [2, 0, 1, 2], [0, 4, 0, 0], [0, 1, 0, 1])
+    rows = made(
+        [1, 2, 3, 10],
+        [0, 1, 0, 0],
+        [1, 0, 0, 1],
+        [5, 5, 6, 4],
+        [2, 0, 1, 2],
+        [0, 4, 0, 0],
+        [0, 1, 0, 1],
+    )
     found = evaluate.summarise(rows, 50.0)
     returns = np.asarray([1, -48, 3, 10.0])
     width = stats.t.ppf(0.975, 3) * returns.std(ddof=1) / 2
@@ -202,9 +212,11 @@ def test_learned_values_are_those_of_the_network():
 def recorded():
     still = PROBE.replace(params=probe.make_params(slip=0.0), x=jnp.asarray(np.inf, jnp.float32))
     starts = jax.vmap(probe.start_at)(jnp.asarray([4.0, 1.0, 3.0]))
-    values = lambda percept: jnp.where(  # noqa: E731
-        percept.encoded.rest[:, :1] == 1.0, jnp.asarray([[0.0, 1, 0]]), eager(percept)
-    )
+
+    def values(percept):
+        left = jnp.asarray([[0.0, 1.0, 0.0]])
+        return jnp.where(percept.encoded.rest[:, :1] == 1.0, left, eager(percept))
+
     record = jax.jit(evaluate.record, static_argnums=(2, 4))
     return record(jax.random.key(0), still, values, starts, 5)
 
@@ -216,7 +228,9 @@ def test_a_recording_shows_every_step_and_then_the_end():
     np.testing.assert_array_equal(cells, [[4, 5, 6, 6, 6], [1, 0, 0, 0, 0], [3, 4, 5, 6, 6]])
     alive = [[1, 1, 0, 0, 0], [1, 0, 0, 0, 0], [1, 1, 1, 0, 0]]
     np.testing.assert_array_equal(shown.alive.T, alive)
-    np.testing.assert_array_equal(shown.states.time.T, [[0, 1, 2, 2, 2], [0, 1, 1, 1, 1], [0, 1, 2, 3, 3]])
+    np.testing.assert_array_equal(
+        shown.states.time.T, [[0, 1, 2, 2, 2], [0, 1, 1, 1, 1], [0, 1, 2, 3, 3]]
+    )
     np.testing.assert_array_equal(shown.action[:2, 0], [probe.RIGHT, probe.RIGHT])
     assert shown.action[0, 1] == probe.LEFT
 

@@ -39,12 +39,12 @@ def pick(tree, index):
 def sequences(rng, rows, steps, choices):
     """Indices (rows, steps) into a table: half the rows repeat one, which leads farthest."""
     free, same = rng.integers(choices, size=(rows, steps)), rng.integers(choices, size=(rows, 1))
-    return jnp.asarray(np.where(rng.random((rows, 1)) < 0.5, same, free))
+    return np.where(rng.random((rows, 1)) < 0.5, same, free)
 
 
 def directions(rng, rows):
     angle = rng.uniform(-np.pi, np.pi, rows)
-    return jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def path(start, controls, step):
@@ -60,21 +60,19 @@ def encounters(env, kind):
     Returns their features (20,000, F), the features of the states that have these features, and
     whether the hazard was hit.
     """
-    sub, rows, rng = sub_of(env, kind), 20_000, np.random.default_rng(0)
+    sub, rows, rng = jax.device_get(sub_of(env, kind)), 20_000, np.random.default_rng(0)
     source, model, steps = sub.source, sub.agent, sub.source.horizon
-    table = jax.tree.map(lambda *a: jnp.concatenate(a), model.actions, model.baseline.controls)
+    table = jax.tree.map(lambda *a: np.concatenate(a), model.actions, model.baseline.controls)
     controls = pick(table, sequences(rng, rows, steps, len(table.acceleration)))
-    place = jnp.asarray(rng.uniform(-3, 3, (rows, 2)))
-    speed = jnp.asarray(rng.choice(np.asarray(model.speeds), rows))
+    place, speed = rng.uniform(-3, 3, (rows, 2)), rng.choice(model.speeds, rows)
     agents = Vehicle(position=place, heading=directions(rng, rows), speed=speed)
-    when, rim = jnp.asarray(rng.integers(steps + 1, size=rows)), directions(rng, rows) * (1 - 1e-9)
+    when, rim = rng.integers(steps + 1, size=rows), directions(rng, rows) * (1 - 1e-9)
     if kind == "wall":
-        noise, others = jnp.zeros((rows, steps)), jnp.zeros((rows, 2))
+        noise, others = np.zeros((rows, steps)), np.zeros((rows, 2))
     else:
         drives = source.behaviour.controls
         noise = pick(drives, sequences(rng, rows, steps, len(drives.acceleration)))
-        fast = jnp.asarray(rng.choice(np.asarray(source.speeds), rows))
-        start = jnp.zeros((rows, 2))
+        fast, start = rng.choice(source.speeds, rows), np.zeros((rows, 2))
         others = Vehicle(position=start, heading=directions(rng, rows), speed=fast)
 
     def meet(agent, controls, when, rim, hazard, noise):
@@ -95,14 +93,15 @@ def encounters(env, kind):
         again = source.features(*source.state_of(features))
         return features, again, hits.any() | source.hits(*end)
 
-    return jax.jit(jax.vmap(meet))(agents, controls, when, rim, others, noise)
+    met = jax.jit(jax.vmap(meet))(agents, controls, when, rim, others, noise)
+    return jax.device_get(met)
 
 
 @each_kind
 def test_whatever_can_be_hit_within_the_horizon_lies_in_the_window(env, kind, x64):
     features, _, hit = encounters(env, kind)
     assert hit.all()  # they do meet
-    window = sub_of(env, kind).source.window
+    window = jax.device_get(sub_of(env, kind).source.window)
     assert window.contains(features[:, :2]).all()
     # The window is not so wide that anything would pass: ahead it is nearly reached.
     assert features[:, 0].max() > 0.95 * window.upper[0]
@@ -143,9 +142,8 @@ def test_the_farthest_meeting_lies_just_inside_the_window(env, kind, side, x64):
     relative = source.features(agent, hazard)[:2]
     window = source.window
     assert window.contains(relative)
-    # Turning faster than a right angle allows is the only slack.
     limit = towards @ np.where(towards > 0, window.upper, window.lower)
-    assert 0.99 * limit < towards @ relative <= limit
+    np.testing.assert_allclose(towards @ relative, limit, atol=1e-6)
 
 
 @each_kind
@@ -191,7 +189,7 @@ def test_a_hazard_at_exactly_its_distance_is_not_hit():
     assert other.hits(agent, make_vehicle((0.0, float(nearer)), 1.0, 0.0))
 
 
-@each_kind
+@pytest.mark.parametrize(("env", "kind"), [(circuit, "wall"), (jam, "obstacle")])
 def test_samples_fill_the_window_and_hold_the_reachable_speeds(env, kind):
     sub = sub_of(env, kind)
     keys = jax.random.split(jax.random.key(1), 8000)

@@ -76,9 +76,9 @@ def test_a_folder_without_permission_is_named(tmp_path):
     tmp_path.chmod(0o500)
     with pytest.raises(StorageError, match="Permission denied"):
         storage.write_bytes(tmp_path / "file", b"data")
-    with pytest.raises(StorageError, match="out is .*cannot be"):
+    with pytest.raises(StorageError, match=r"out is .*cannot be"):
         storage.new_folder(tmp_path / "new")
-    with pytest.raises(StorageError, match="out is .*cannot be written"):
+    with pytest.raises(StorageError, match=r"out is .*cannot be written"):
         storage.new_folder(tmp_path)
     tmp_path.chmod(0o700)
 
@@ -137,9 +137,9 @@ def test_a_new_folder_is_made_with_its_parents(tmp_path):
 
 def test_a_folder_with_anything_in_it_is_refused(tmp_path):
     (tmp_path / ".hidden").touch()
-    with pytest.raises(StorageError, match="out is .* must be a new or an empty folder"):
+    with pytest.raises(StorageError, match=r"out is .* must be a new or an empty folder"):
         storage.new_folder(tmp_path)
-    with pytest.raises(StorageError, match="out is .* must be a new or an empty folder"):
+    with pytest.raises(StorageError, match=r"out is .* must be a new or an empty folder"):
         storage.new_folder(tmp_path / ".hidden")
 
 

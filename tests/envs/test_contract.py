@@ -302,8 +302,8 @@ def renew(where, rows, chunk):
     return base.renew(where, rows, make, chunk)
 
 
-@pytest.mark.parametrize("marked", [[], [0], [12], [1, 5, 7, 8, 12], list(range(13))])
-@pytest.mark.parametrize("chunk", [1, 4, 16])
+@pytest.mark.parametrize("marked", [[], [12], [1, 5, 7, 8, 12], list(range(13))])
+@pytest.mark.parametrize("chunk", [4, 16])
 def test_renew_computes_no_row_that_is_not_marked(marked, chunk):
     asked = []
 

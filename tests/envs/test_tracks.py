@@ -154,7 +154,7 @@ def test_the_nearest_centre_point_is_found_all_over_the_track_and_beyond_its_wal
 lengths = st.integers(25, 150).map(lambda steps: steps * SPACING)
 
 
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(lengths, st.floats(0.35, 1.5), st.floats(0.15, 0.3), st.sampled_from([-1, 1]))
 def test_closed_ovals_are_tracks_with_walls_on_both_sides(straight, radius, half_width, side):
     plan = oval(straight, radius, half_width, side)

@@ -96,7 +96,9 @@ def test_an_update_learns_from_the_least_threatening_action_where_nothing_is_sec
 def test_errors_and_loss_by_hand():
     params = jnp.asarray([[0.0, 1.0, 2.0], [3.0, 2.0, 99.0]])
     target = jnp.asarray([[0.0, 0.0, 0.0], [4.0, 7.0, 99.0]])
-    items = batch([0, 0, 1], [1, 2, 0], [1.0, 2.0, -5.0], [0.9, 0.81, 0.0], [1, 0, 1], [NOT_LAST] * 3)
+    items = batch(
+        [0, 0, 1], [1, 2, 0], [1.0, 2.0, -5.0], [0.9, 0.81, 0.0], [1, 0, 1], [NOT_LAST] * 3
+    )
     config = dataclasses.replace(CONFIG, reward_scale=0.5)
     weights = jnp.asarray([1.0, 0.5, 0.25])
     goals = np.asarray([0.5 + 0.9 * 4, 1.0 + 0.81 * 0, -2.5])
@@ -173,7 +175,9 @@ def test_the_rate_falls_to_a_tenth_if_annealed(anneal):
 
 def test_repeated_updates_solve_a_chain():
     # 0 -> 1 -> end with reward 1; the last action of 1 pays 100 and is inadmissible.
-    items = batch([0, 1, 1], [0, 0, 2], [0.0, 1.0, 100.0], [0.9, 0.0, 0.0], [1, 1, 1], [NOT_LAST] * 3)
+    items = batch(
+        [0, 1, 1], [0, 0, 2], [0.0, 1.0, 100.0], [0.9, 0.0, 0.0], [1, 1, 1], [NOT_LAST] * 3
+    )
     config = dataclasses.replace(CONFIG, learning_rate=0.1, polyak=0.3)
     params = jnp.zeros((2, 3))
     state = learner(params, params, config)

