@@ -75,7 +75,7 @@ class Trained(NamedTuple):
 
     params: Any  # of the Q-network, leading axis (seeds,)
     history: list[dict[str, Any]]  # one row per chunk and seed
-    seconds: float  # without compilation
+    seconds: float  # of all seeds together, without compilation
     compile_seconds: float
 
 

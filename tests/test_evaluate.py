@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import probe
 import pytest
+from quick import compile_soon  # noqa: F401
 from scipy import stats
 
 from rp_jax import evaluate

@@ -225,7 +225,11 @@ def _out_of_place(position: Array, params: Params) -> Array:
 
 
 def draw(key: Array, state: State, action: Array, params: Params) -> Draws:
-    """The random numbers of the step from `state` under `action`."""
+    """The random numbers of the step from `state` under `action`.
+
+    Obstacle n's are the same among any number of obstacles: JAX's (partitionable) draws depend on
+    the key and the position alone.
+    """
     drive, place = jax.random.split(key)
     controls = params.obstacle.draw(drive, state.present.shape)
     # Obstacles appear away from where the agent will be.

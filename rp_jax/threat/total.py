@@ -16,7 +16,10 @@ CHUNK = 2048  # rows per call of a network; fixed, so that no result depends on 
 def total_threat(
     models: Mapping[str, ThreatModel], agents: Any, hazards: Mapping[str, Hazards]
 ) -> Array:
-    """sum_n T_n(s, .) over all hazards inside their windows, for a batch of states.
+    """sum_n T_n(s, .) over all hazards inside their windows, for a batch of states (Theorem 3).
+
+    The theorem bounds rollouts that are not cut: the models' horizon leaves out what happens after
+    it, up to beta^horizon per unit of danger.
 
     Args:
         models: by kind of hazard.

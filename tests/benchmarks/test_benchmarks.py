@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import probe
 import pytest
+from quick import unoptimised
 
 from benchmarks import env_step, measure, recon, setups, threat_query, train_step
 from benchmarks.measure import Row
@@ -14,12 +15,10 @@ from experiments import circuit, jam
 
 
 @pytest.fixture(autouse=True, scope="module")
-def compile_soon():
-    """Programs that run for a moment need no optimising; flashbax needs rank promotion."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    with jax.numpy_rank_promotion("allow"):
+def programs_of_a_moment():
+    """They need no optimising; flashbax needs rank promotion."""
+    with unoptimised(), jax.numpy_rank_promotion("allow"):
         yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 def sane(row):

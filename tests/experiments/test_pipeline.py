@@ -6,6 +6,7 @@ import sys
 import jax
 import numpy as np
 import pytest
+from quick import unoptimised
 
 from experiments import circuit, cli, jam, pipeline, tables
 from rp_jax import storage
@@ -27,12 +28,10 @@ TINY = (
 
 
 @pytest.fixture(autouse=True, scope="module")
-def compile_soon():
-    """Programs that run for a moment need no optimising; flashbax needs rank promotion."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    with jax.numpy_rank_promotion("allow"):
+def programs_of_a_moment():
+    """They need no optimising; flashbax needs rank promotion."""
+    with unoptimised(), jax.numpy_rank_promotion("allow"):
         yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 def go(name, out, *options):

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import probe
 import pytest
+from quick import unoptimised
 
 from rp_jax import evaluate
 from rp_jax.planning import loop
@@ -46,15 +47,15 @@ def keyless(state):
 
 @pytest.fixture(autouse=True)
 def allow_rank_promotion():
-    with jax.numpy_rank_promotion("allow"):  # flashbax's sampling needs it
+    """Flashbax's sampling needs it."""
+    with jax.numpy_rank_promotion("allow"):
         yield
 
 
 @pytest.fixture
 def compile_soon():
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+    with unoptimised():
+        yield
 
 
 METHODS = {
@@ -156,18 +157,17 @@ def test_seeds_side_by_side_learn_what_each_learns_alone(compile_soon):
     keys = jnp.stack([jax.random.key(k) for k in (1, 5)])
     states, _ = jax.jit(jax.vmap(loop.init, (0, None, None)), static_argnums=2)(keys, pmdp, CONFIG)
     many = jax.jit(jax.vmap(loop.chunk, (0, None, None, None)), static_argnums=(2, 3))
-    states, sums = many(states, pmdp, CONFIG, PART)
+    states, sums = many(states, pmdp, CONFIG, PART // 2)
+    network = loop.make_network(CONFIG, pmdp)
+    seen = pmdp.perceive(jax.vmap(probe.start_at)(jnp.arange(1.0, 6.0))).encoded
     for i, key in enumerate(keys):
         alone, _ = start(key, pmdp, CONFIG)
-        alone, metrics = advance(alone, pmdp, CONFIG, PART)
-        mine = jax.tree.map(lambda a, i=i: a[i], (states.learner.params, sums))
-        for a, b in zip(
-            jax.tree.leaves(mine[0]), jax.tree.leaves(alone.learner.params), strict=True
-        ):
-            np.testing.assert_allclose(a, b, atol=1e-4)
-        assert mine[1].steps == metrics.steps
-        assert mine[1].crashes == metrics.crashes == 0
-        np.testing.assert_allclose(mine[1].score, metrics.score, rtol=0.05)
+        alone, metrics = advance(alone, pmdp, CONFIG, PART // 2)
+        params, mine = jax.tree.map(lambda a, i=i: a[i], (states.learner.params, sums))
+        values, wanted = (network.apply(p, seen) for p in (params, alone.learner.params))
+        np.testing.assert_allclose(values, wanted, atol=1e-3)
+        assert (mine.steps, mine.crashes) == (metrics.steps, metrics.crashes) == (25 * 32, 0)
+        np.testing.assert_allclose(mine.loss, metrics.loss, rtol=1e-2)
 
 
 def test_a_chunk_is_compiled_once_whatever_the_values():
@@ -300,11 +300,19 @@ def test_states_without_admissible_actions_are_counted():
     assert metrics.crashes == 0
 
 
-def test_the_paper_s_network_learns_from_prioritised_replay(compile_soon):
+def test_the_paper_s_network_learns_from_the_smallest_prioritised_replay(compile_soon):
     learner = DQNConfig(gamma=0.9, anneal=False, polyak=0.0, period=3)
     config = dataclasses.replace(
-        CONFIG, network="paper", learner=learner, prioritised=True, n_step=1, updates=2
+        CONFIG,
+        network="paper",
+        learner=learner,
+        updates=2,
+        n_step=1,
+        replay=64,
+        replay_start=33,
+        prioritised=True,
     )
+    config.validate("planning")
     pmdp = probe.make_pmdp(probe, PARAMS, 0.5, pool=1)
     state, _ = start(jax.random.key(10), pmdp, config)
     after, metrics = advance(state, pmdp, config, 10)
@@ -316,8 +324,8 @@ def test_the_paper_s_network_learns_from_prioritised_replay(compile_soon):
     # Priorities are no longer all alike: errors have been written.
     tree = after.replay.sum_tree_state
     leaves = np.asarray(tree.nodes)[2**tree.tree_depth - 1 :]
-    assert (leaves > 0).sum() == 320 + 10 * 32
-    assert len(np.unique(leaves)) > 50
+    assert (leaves > 0).sum() == 64
+    assert len(np.unique(leaves)) > 20
 
 
 def test_exploration_falls_to_its_end_and_stays():
@@ -345,16 +353,6 @@ def test_sizes_follow_from_the_settings():
     assert CONFIG.samples_per_step == 2
     assert dataclasses.replace(CONFIG, steps=6401).iterations == 201
     assert dataclasses.replace(CONFIG, updates=3).samples_per_step == 6
-
-
-def test_the_smallest_replay_that_is_allowed_works(compile_soon):
-    config = dataclasses.replace(CONFIG, replay=64, replay_start=33, n_step=1)
-    config.validate("planning")
-    pmdp = probe.make_pmdp(probe, PARAMS, 0.5)
-    state, _ = start(jax.random.key(12), pmdp, config)
-    state, metrics = advance(state, pmdp, config, 5)
-    assert np.isfinite(metrics.loss)
-    assert metrics.inadmissible == 0
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quick import compile_soon  # noqa: F401
 from scipy.special import expit
 
 from rp_jax.planning.networks import NETWORKS, POOLS, PaperNetwork, TunedNetwork

@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import probe
 import pytest
+from quick import compile_soon  # noqa: F401
 
 from rp_jax.envs import circuit
 from rp_jax.planning.pmdp import encode

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quick import compile_soon  # noqa: F401
 
 from rp_jax.envs import circuit, jam
 from rp_jax.recon import sampling
@@ -14,13 +15,6 @@ from rp_jax.threat.model import ThreatModel, ThreatNetwork
 KINDS = [(circuit, "wall"), (jam, "wall"), (jam, "obstacle")]
 each_kind = pytest.mark.parametrize(("env", "kind"), KINDS, ids=["circuit", "wall", "obstacle"])
 X = 0.01
-
-
-@pytest.fixture(autouse=True, scope="module")
-def compile_soon():
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @functools.cache

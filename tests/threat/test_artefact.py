@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quick import compile_soon  # noqa: F401
 
 from rp_jax import storage
 from rp_jax.envs import circuit, jam

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quick import compile_soon  # noqa: F401
 
 from rp_jax.envs import circuit, jam
 from rp_jax.recon import sampling
@@ -14,8 +15,8 @@ from rp_jax.threat.build import ThreatConfig
 from rp_jax.threat.fit import Dataset, FitConfig
 
 TINY = ThreatConfig(
-    states=300,
-    paths=4,
+    states=150,
+    paths=8,
     test_states=150,
     test_paths=8,
     fit=FitConfig(hidden=(16,), steps=200, batch=64, learning_rate=1e-2),
@@ -43,17 +44,11 @@ def built(env, kind, way):
     """A model learned in the given way of sampling, the latter with prudence; and the progress."""
     sub = short(env)[kind]
     prudence = 1.0 if way == "uniform" else 0.01
-    config = dataclasses.replace(TINY, sampling=way, prudence=prudence)
+    states = 150 if way == "uniform" else 300  # in two parts of the same shape
+    config = dataclasses.replace(TINY, states=states, sampling=way, prudence=prudence)
     told = []
     found = build.build(jax.random.key(0), sub, config, 0.01, lambda *news: told.append(news))
     return sub, found, told
-
-
-@pytest.fixture(autouse=True, scope="module")
-def compile_soon():
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 each_case = pytest.mark.parametrize(("env", "kind", "way"), CASES)
@@ -121,7 +116,7 @@ def test_the_report_is_that_of_fresh_states(exact):
 
 def test_a_fit_shorter_than_its_chunks_still_runs():
     sub, _, _ = built(circuit, "wall", "uniform")
-    data = Dataset(draw(jax.random.key(3), sub, 300), jnp.full((300, 15), 0.1))
+    data = Dataset(draw(jax.random.key(3), sub, 150), jnp.full((150, 15), 0.1))
     config = dataclasses.replace(TINY.fit, steps=3)
     _, curve = build.fitted(jax.random.key(4), sub, data, config, chunks=2)
     assert [row["step"] for row in curve] == [1, 2]
