@@ -150,7 +150,8 @@ class WallPoint(struct.PyTreeNode):
 
     def mirrored(self, features: Array) -> Array:
         """See `HazardSource`."""
-        return features * jnp.asarray([1.0, -1.0, 1.0], features.dtype)
+        signs = jnp.asarray([1.0, -1.0, 1.0], features.dtype)
+        return features * jnp.broadcast_to(signs, features.shape)
 
     def sample(self, key: Array, agent: AgentModel) -> tuple[Vehicle, Array]:
         """See `HazardSource`."""
@@ -213,7 +214,8 @@ class MovingObstacle(struct.PyTreeNode):
 
     def mirrored(self, features: Array) -> Array:
         """See `HazardSource`."""
-        return features * jnp.asarray([1.0, -1.0, 1.0, -1.0, 1.0, 1.0], features.dtype)
+        signs = jnp.asarray([1.0, -1.0, 1.0, -1.0, 1.0, 1.0], features.dtype)
+        return features * jnp.broadcast_to(signs, features.shape)
 
     def sample(self, key: Array, agent: AgentModel) -> tuple[Vehicle, Vehicle]:
         """See `HazardSource`."""

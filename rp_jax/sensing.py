@@ -89,7 +89,9 @@ def nearest_of(points: np.ndarray, margin: float, cell: float) -> PointGrid:
 def bin_edges(bins: int) -> Array:
     """Directions (bins + 1, 2) of the edges of equal angular bins, from -pi to pi."""
     angle = np.arange(bins + 1) * (2 * np.pi / bins) - np.pi
-    return jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=-1), float)
+    edges = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    # Exact along the axes, so that a point straight ahead or behind is on an edge.
+    return jnp.asarray(np.where(np.abs(edges) < 1e-9, 0.0, edges), float)
 
 
 def _approximate_angle(x: Array, y: Array) -> Array:

@@ -62,7 +62,8 @@ def to_bits(admissible: Array) -> Array:
     chex.assert_rank(admissible, 1)
     if admissible.shape[0] > 31:
         raise ValueError(f"admissible has {admissible.shape[0]} actions; it must have at most 31")
-    return jnp.sum(jnp.where(admissible, 1 << jnp.arange(admissible.shape[0]), 0))
+    bits = jnp.where(admissible, 1 << jnp.arange(admissible.shape[0]), 0)
+    return jnp.sum(bits, dtype=jnp.int32)
 
 
 def from_bits(bits: Array, num_actions: int) -> Array:

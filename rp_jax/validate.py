@@ -8,6 +8,14 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
+def _float(value: float) -> float:
+    """As a float; infinite where it is too large for one."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
 def one_of(field: str, value: T, allowed: Iterable[T]) -> T:
     """Returns `value` if it is one of `allowed`, else raises ValueError."""
     choices = list(allowed)
@@ -46,7 +54,7 @@ def number(
         rules.append(f"at most {most:g}")
     kind = numbers.Integral if integer else numbers.Real
     good = isinstance(value, kind) and not isinstance(value, bool)
-    good = good and not math.isnan(value) and (infinite or math.isfinite(value))
+    good = good and not math.isnan(_float(value)) and (infinite or math.isfinite(_float(value)))
     good = good and (least is None or value >= least) and (most is None or value <= most)
     good = good and (above is None or value > above)
     if not good:

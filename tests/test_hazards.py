@@ -339,3 +339,10 @@ def test_the_vehicles_of_the_jam_and_of_its_sub_rmdps_move_alike_to_the_bit():
     stayed = ~np.isnan(np.asarray(reached.obstacles.speed))
     assert 0.5 < stayed.mean() < 1
     same_bits(pick(alone, stayed), pick(reached.obstacles, stayed))
+
+
+@pytest.mark.parametrize("kind", ["wall", "obstacle"])
+def test_mirrored_takes_batches(kind):
+    source = getattr(jam.make_params(), kind)
+    features = jnp.ones((4, 3 if kind == "wall" else 6))
+    assert source.mirrored(features).shape == features.shape

@@ -169,3 +169,8 @@ def test_farther_than_the_margin_some_near_point_is_returned():
 def test_of_equally_near_points_the_first_is_returned():
     for points in ([[0.5, 0.0], [-0.5, 0.0]], [[-0.5, 0.0], [0.5, 0.0]]):
         assert nearest_of(np.asarray(points), 1.0, 0.2).nearest(jnp.zeros(2)) == 0
+
+
+def test_points_on_the_axes_are_on_an_edge():
+    points = jnp.asarray([[0.0, 0.5], [-0.5, 0.0], [0.0, -0.5]])
+    assert not lidar(points, jnp.zeros(2), jnp.asarray([1.0, 0.0]), bin_edges(360)).any()

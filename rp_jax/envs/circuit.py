@@ -74,8 +74,8 @@ def make_params(
         ValueError: a value is out of range, or the track cannot be driven.
     """
     one_of("fidelity", fidelity, FIDELITIES)
-    positive("time_limit", time_limit, integer=True)
-    positive("horizon", horizon, integer=True)
+    positive("time_limit", time_limit, most=10**9, integer=True)
+    positive("horizon", horizon, most=100, integer=True)
     positive("radius", radius)
     positive("beta", beta, most=1.0)
     if isinstance(track, str):

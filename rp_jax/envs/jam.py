@@ -115,13 +115,13 @@ def make_params(
         ValueError: a value is out of range.
     """
     one_of("fidelity", fidelity, FIDELITIES)
-    positive("time_limit", time_limit, integer=True)
+    positive("time_limit", time_limit, most=10**9, integer=True)
     positive("radius", radius, most=0.2)
     room = int((ROOM / (2 * radius)) ** 2)  # how many fit, side by side
     number("num_obstacles", num_obstacles, least=1, most=room, integer=True)
     positive("beta", beta, most=1.0)
-    positive("wall_horizon", wall_horizon, integer=True)
-    positive("obstacle_horizon", obstacle_horizon, integer=True)
+    positive("wall_horizon", wall_horizon, most=100, integer=True)
+    positive("obstacle_horizon", obstacle_horizon, most=100, integer=True)
     agent = AgentModel(
         actions=control_table(ACCELERATIONS, TURNS),
         baseline=independent_controls(

@@ -51,7 +51,7 @@ class TrackPlan:
         """Turns by whole `degrees` (left is positive) on a circle of `radius` > 0."""
         if not (np.isfinite(radius) and radius > 0):
             raise ValueError(f"curve: radius is {radius}; it must be positive and finite")
-        if degrees == 0 or degrees != round(degrees):
+        if not np.isfinite(degrees) or degrees == 0 or degrees != round(degrees):
             raise ValueError(f"curve: degrees is {degrees}; it must be a whole number, not 0")
         side = np.sign(degrees)
         turn = np.radians(np.arange(abs(int(degrees)) + 1)) * side
@@ -67,6 +67,8 @@ class TrackPlan:
         turn = round(left)
         if abs(left - turn) > 1e-6:
             raise ValueError(f"close: {left} degrees are left to turn; they must be whole")
+        if turn == -180 and self.position[1] > 0:
+            turn = 180  # from above, the way home is to the left
         sine = np.sin(self.angle)
         # The turn ends on the line y = 0 if it starts at this height.
         height = radius * abs(1 - np.cos(self.angle)) * np.sign(self.position[1])
@@ -81,7 +83,10 @@ class TrackPlan:
         if plan.position[0] >= 0:
             raise ValueError(f"close: the turn ends at x = {plan.position[0]:.3f}; it must be < 0")
         plan = plan.straight(-plan.position[0])
-        # The last straight keeps its end point, as the released track does.
+        # The last straight keeps its end point, as the released track does, unless that is the
+        # very start.
+        if np.hypot(*plan.position) < 1e-9:
+            return plan
         end = np.asarray([plan.position])
         return plan._extend(end, np.asarray([plan.angle]), plan.position, plan.angle)
 

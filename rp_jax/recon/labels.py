@@ -21,7 +21,7 @@ class Labels(struct.PyTreeNode):
     """Threats and their standard errors."""
 
     threat: Array  # (A,)
-    stderr: Array  # (A,), 0 where exact
+    stderr: Array  # (A,), 0 where exact, and where all sampled paths agree
 
 
 # (key, agent, hazard, sub) -> Labels, unbatched.
@@ -98,6 +98,12 @@ def best_estimator(sub: SubRMDP, paths: int) -> Estimator:
     """Exact enumeration where the hazard stays put, Monte Carlo with `paths` rollouts elsewhere."""
     if sub.source.static:
         return exact_threat
+    return _sampled(paths)
+
+
+@functools.cache
+def _sampled(paths: int) -> Estimator:
+    """One object per number of paths, so that `label` compiles once for it."""
     return functools.partial(monte_carlo_threat, paths=paths)
 
 

@@ -226,3 +226,21 @@ def test_a_piece_that_cannot_be_drawn_names_the_field_and_the_value(draw, messag
 def test_a_plan_that_is_no_track_says_where_and_why(plan, message):
     with pytest.raises(ValueError, match=message):
         made(plan)
+
+
+def test_the_last_point_of_a_closed_plan_leads_onward():
+    plan = TrackPlan().straight(2).curve(1, -180).straight(3).close(radius=1)
+    track = make_track(plan, 0.1, 0.7)
+    np.testing.assert_allclose(track.onward[-1], [1, 0], atol=0.05)
+
+
+def test_close_turns_left_from_above():
+    plan = TrackPlan().straight(2).curve(1, 180).straight(3).close(radius=1)
+    track = make_track(plan, 0.1, 0.7)
+    assert track.centre[:, 1].min() >= -1e-6
+
+
+@pytest.mark.parametrize("degrees", [float("nan"), float("inf")])
+def test_degrees_that_are_not_finite_are_named(degrees):
+    with pytest.raises(ValueError, match=f"^curve: degrees is {degrees}"):
+        TrackPlan().curve(1, degrees)
