@@ -118,4 +118,5 @@ def main(name: str, run: Callable[[], list[Row]]) -> None:
     """The command line of one benchmark."""
     parser = argparse.ArgumentParser(prog=f"python -m benchmarks.{name}")
     parser.add_argument("--out", type=Path, help="folder for the JSON")
-    report(name, run(), parser.parse_args().out)
+    out = parser.parse_args().out
+    report(name, run(), out)

@@ -56,7 +56,7 @@ def main(
     try:
         pipeline.run(task, config, chosen.preset, folder)
     except KeyboardInterrupt:
-        console.console.print(f"[yellow]interrupted[/yellow]: what was finished is in {folder}")
+        console.say(f"interrupted: what was finished is in {folder}", style="yellow")
         raise SystemExit(130) from None
     return folder
 
@@ -67,5 +67,5 @@ def bad_input() -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        console.console.print(f"[red]error:[/red] {error}", highlight=False, soft_wrap=True)
+        console.say(f"error: {error}", style="red")
         raise SystemExit(2) from None

@@ -20,6 +20,11 @@ from rich.table import Table
 console = Console()
 
 
+def say(text: str, style: str | None = None) -> None:
+    """Prints a line as it is: brackets in it are no markup."""
+    console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+
+
 class Bar:
     """One stage's progress bar; call it with what is done and anything worth saying."""
 

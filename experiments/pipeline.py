@@ -190,7 +190,7 @@ def plan(task: Task, config: Config, models: Mapping, folder: Path) -> Trained:
     steps = (warm + chunks * length) * planning.num_envs
     pmdp = make_pmdp(task, config, models, task.train)
     keys = jnp.stack([key_of(config.seed + i, PLANNING) for i in range(config.seeds)])
-    console.console.print(
+    console.say(
         f"planning: {config.seeds} seed(s) x {steps:,} steps, "
         f"{planning.samples_per_step:g} samples replayed per step, {method_name(config)}"
     )
@@ -367,7 +367,7 @@ def run(task: Task, config: Config, preset: str, folder: Path) -> None:
         },
     }
     storage.write_json(folder / "training.json", training)
-    console.console.print(
+    console.say(
         f"training: {training['steps']:,} steps, {training['crashes']} crashes in "
         f"{training['episodes']:,} episodes, {training['inadmissible']} inadmissible actions "
         f"taken; {trained.seconds:.1f} s after {trained.compile_seconds:.1f} s of compilation"
@@ -378,4 +378,4 @@ def run(task: Task, config: Config, preset: str, folder: Path) -> None:
         with console.progress("figures") as bar:
             pmdp = make_pmdp(task, config, models, task.train)
             task.draw(Finished(task, config, pmdp, trained, rows, curves, figures, bar))
-    console.console.print(f"results: {folder}")
+    console.say(f"results: {folder}")

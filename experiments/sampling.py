@@ -130,7 +130,7 @@ def main() -> None:
     rows = run(config)
     storage.write_json(folder / "sampling.json", {"settings": config.__dict__, "rows": rows})
     plot(rows, folder / "sampling.png")
-    console.console.print(f"results: {folder}")
+    console.say(f"results: {folder}")
 
 
 if __name__ == "__main__":

@@ -33,9 +33,11 @@ def write_bytes(path: Path, data: bytes) -> None:
             os.fsync(file.fileno())
         os.chmod(name, 0o644)
         os.replace(name, path)
-    except OSError as error:
+    except BaseException as error:
         Path(name).unlink(missing_ok=True)
-        raise StorageError(f"{path}: cannot be written ({error.strerror})") from error
+        if isinstance(error, OSError):
+            raise StorageError(f"{path}: cannot be written ({error.strerror})") from error
+        raise
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)
@@ -70,12 +72,14 @@ def new_folder(path: Path) -> Path:
         StorageError: it exists and holds something, or cannot be created or written.
     """
     path = Path(path)
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise StorageError(f"out is {path}; it must be a new or an empty folder, but this exists")
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        taken = path.exists() and (not path.is_dir() or any(path.iterdir()))
+        if not taken:
+            path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StorageError(f"out is {path}; it cannot be created ({error.strerror})") from error
+    if taken:
+        raise StorageError(f"out is {path}; it must be a new or an empty folder, but this exists")
     if not os.access(path, os.W_OK):
         raise StorageError(f"out is {path}; it cannot be written")
     return path

@@ -154,14 +154,13 @@ def test_two_chunks_are_one_of_twice_the_length():
 
 def test_seeds_side_by_side_learn_what_each_learns_alone(compile_soon):
     pmdp, _, _ = learned("RP")
-    keys = jnp.stack([jax.random.key(k) for k in (1, 5)])
-    states, _ = jax.jit(jax.vmap(loop.init, (0, None, None)), static_argnums=2)(keys, pmdp, CONFIG)
+    begun = [start(jax.random.key(k), pmdp, CONFIG)[0] for k in (1, 5)]
+    states = jax.tree.map(lambda *a: jnp.stack(a), *begun)
     many = jax.jit(jax.vmap(loop.chunk, (0, None, None, None)), static_argnums=(2, 3))
     states, sums = many(states, pmdp, CONFIG, PART // 2)
     network = loop.make_network(CONFIG, pmdp)
     seen = pmdp.perceive(jax.vmap(probe.start_at)(jnp.arange(1.0, 6.0))).encoded
-    for i, key in enumerate(keys):
-        alone, _ = start(key, pmdp, CONFIG)
+    for i, alone in enumerate(begun):
         alone, metrics = advance(alone, pmdp, CONFIG, PART // 2)
         params, mine = jax.tree.map(lambda a, i=i: a[i], (states.learner.params, sums))
         values, wanted = (network.apply(p, seen) for p in (params, alone.learner.params))

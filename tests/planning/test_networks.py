@@ -9,6 +9,8 @@ from rp_jax.planning.networks import NETWORKS, POOLS, PaperNetwork, TunedNetwork
 from rp_jax.planning.pmdp import Encoded
 
 SCALE = (1.0, 0.5, 10.0)
+start = jax.jit(lambda network, key, seen: network.init(key, seen), static_argnums=0)
+ask = jax.jit(lambda network, params, seen: network.apply(params, seen), static_argnums=0)
 
 
 def seen(lead=(4,), bins=24):
@@ -31,7 +33,7 @@ def layers(params):
 def test_the_tuned_network_is_a_perceptron_on_nearness_and_scaled_values():
     encoded = seen()
     network = TunedNetwork(num_actions=5, scale=SCALE, hidden=(7, 6))
-    params = network.init(jax.random.key(0), encoded)
+    params = start(network, jax.random.key(0), encoded)
     nearness = 1 - np.asarray(encoded.scan, float) / 255  # 0 where nothing is seen
     z = np.concatenate([nearness, np.asarray(encoded.rest) * SCALE], axis=-1)
     found = layers(params)
@@ -39,14 +41,14 @@ def test_the_tuned_network_is_a_perceptron_on_nearness_and_scaled_values():
         z = z @ found[name][0] + found[name][1]
         z = z * expit(z)
     z = z @ found["Dense_2"][0] + found["Dense_2"][1]
-    np.testing.assert_allclose(network.apply(params, encoded), z, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(ask(network, params, encoded), z, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(("bins", "pools"), [(24, 3), (21, 2), (13, 1), (8, 1)])
 def test_the_paper_s_network_is_a_convolution_a_pool_and_tanh_units(bins, pools):
     encoded = seen(bins=bins)
     network = PaperNetwork(num_actions=5, scale=SCALE)
-    params = network.init(jax.random.key(0), encoded)
+    params = start(network, jax.random.key(0), encoded)
     params["params"]["bias"] = jnp.asarray([0.1, -0.2, 0.3])
     found = layers(params)
     scan = np.asarray(encoded.scan, float) / 255
@@ -63,20 +65,20 @@ def test_the_paper_s_network_is_a_convolution_a_pool_and_tanh_units(bins, pools)
         z = np.tanh(z @ found[name][0] + found[name][1])
         assert z.shape == (4, width)
     z = z @ found["Dense_2"][0] + found["Dense_2"][1]
-    np.testing.assert_allclose(network.apply(params, encoded), z, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(ask(network, params, encoded), z, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.parametrize("lead", [(), (1,), (2, 3)])
 def test_leading_axes_are_kept(name, lead):
     network = NETWORKS[name](num_actions=5, scale=SCALE)
-    params = network.init(jax.random.key(0), seen())
+    params = start(network, jax.random.key(0), seen())
     many = seen(lead)
-    values = network.apply(params, many)
+    values = ask(network, params, many)
     assert values.shape == (*lead, 5)
     rows = jax.tree.map(lambda a: a.reshape(-1, a.shape[-1]), many)
     np.testing.assert_allclose(
-        values.reshape(-1, 5), network.apply(params, rows), rtol=1e-4, atol=1e-5
+        values.reshape(-1, 5), ask(network, params, rows), rtol=1e-4, atol=1e-5
     )
 
 
@@ -84,9 +86,9 @@ def test_leading_axes_are_kept(name, lead):
 def test_the_scan_makes_a_difference(name):
     network = NETWORKS[name](num_actions=5, scale=SCALE)
     encoded = seen()
-    params = network.init(jax.random.key(0), encoded)
+    params = start(network, jax.random.key(0), encoded)
     nearer = encoded._replace(scan=encoded.scan // 4)
-    assert (network.apply(params, encoded) != network.apply(params, nearer)).any()
+    assert (ask(network, params, encoded) != ask(network, params, nearer)).any()
 
 
 def test_every_network_says_how_the_scan_is_pooled():

@@ -26,9 +26,8 @@ uniform = jax.jit(sampling.uniform, static_argnums=2)
 preferential = jax.jit(sampling.preferential, static_argnums=6)
 
 
-def flat_model(sub, threat):
+def flat_model(sub, width, threat):
     """Says the same of every state and action."""
-    width = uniform(jax.random.key(0), sub, 1).shape[1]
     weights = {"kernel": jnp.zeros((width, 15)), "bias": jnp.zeros(15)}
     shift = jnp.log(threat / (1 - threat))
     params = {"params": {"Dense_0": weights}}
@@ -115,8 +114,8 @@ def test_preferential_draws_follow_their_key(exact):
 @each_kind
 def test_half_the_candidates_lie_near_states_where_the_model_errs(env, kind):
     sub = sub_of(env, kind)
-    model = flat_model(sub, 1e-6)
     features = uniform(jax.random.key(7), sub, 2000)
+    model = flat_model(sub, features.shape[1], 1e-6)
     wrong = jnp.arange(2000) < 2
     threat = jnp.where(wrong[:, None], 0.9, 1e-6) * jnp.ones((1, 15))
     drawn = preferential(jax.random.key(8), sub, model, features, threat, X, 2000)
