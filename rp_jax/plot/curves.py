@@ -37,7 +37,8 @@ def learning_curves(history: Sequence[Mapping[str, Any]], title: str, path: Path
         for s in steps
         if any(r["episodes"] for r in of[s])
     ]
-    axes[0].plot(*zip(*means, strict=True), color=BLUE, label=f"mean of {len(seeds)} seed(s)")
+    label = f"mean of {len(seeds)} seed(s)"
+    axes[0].plot([s for s, _ in means], [mean for _, mean in means], color=BLUE, label=label)
     axes[0].set_ylabel("return while exploring\n(crash penalty included)")
     axes[0].legend(loc="lower right")
     rates, low, high = [], [], []
