@@ -101,10 +101,10 @@ def fitted(
 def prudent(model: ThreatModel, data: Dataset, x: float, rate: float) -> ThreatModel:
     """Shifts the logits up until at most `rate` of the pairs truly above x are called safe.
 
-    The shift is never downwards.
+    The shift is never downwards. Outside 0 < x < 1 no shift could change a decision.
     """
     unsafe = np.asarray(data.threat) > x
-    if not unsafe.any():
+    if not unsafe.any() or not 0 < x < 1:
         return model
     short = np.log(x / (1 - x)) - np.asarray(model.logits(data.features))[unsafe]
     shift = max(0.0, float(np.quantile(short, 1 - rate, method="higher")) + 1e-4)
