@@ -41,18 +41,24 @@ def eager(percept):
     return jnp.tile(jnp.asarray([[0.0, 1.0, 2.0]]), (percept.secure.shape[0], 1))
 
 
+def wander(percept):
+    return scatter(percept.encoded.rest + 0.4, 3)
+
+
+def steer(percept):
+    return scatter(percept.encoded.rest, 15)
+
+
+def at(x):
+    return lambda: PROBE.replace(x=jnp.asarray(x, jnp.float32))
+
+
 POLICIES = {
-    "probe, at random": (lambda: PROBE, lambda p: scatter(p.encoded.rest, 3)),
-    "probe, to the pit": (lambda: PROBE, eager),
-    "probe, no shield": (
-        lambda: PROBE.replace(x=jnp.asarray(np.inf, jnp.float32)),
-        lambda p: scatter(p.encoded.rest + 0.4, 3),
-    ),
-    "probe, never secure": (
-        lambda: PROBE.replace(x=jnp.asarray(-1.0, jnp.float32)),
-        lambda p: scatter(p.encoded.rest, 3),
-    ),
-    "circuit": (narrow, lambda p: scatter(p.encoded.rest, 15)),
+    "probe, at random": (at(0.5), wander),
+    "probe, to the pit": (at(0.5), eager),
+    "probe, no shield": (at(np.inf), wander),
+    "probe, never secure": (at(-1.0), wander),
+    "circuit": (narrow, steer),
 }
 run = jax.jit(evaluate.run_episodes, static_argnums=(2, 3), static_argnames="batch")
 
@@ -112,19 +118,18 @@ def test_episodes_count_what_a_slow_loop_counts(name):
 
 
 def test_the_shield_holds_the_eager_back():
-    rows = run(jax.random.key(0), PROBE, eager, 50, batch=50)
+    rows = run(jax.random.key(0), PROBE, eager, 11, batch=4)
     assert rows.danger.sum() == 0
     assert (rows.length == 12).all()  # it waits beside the pit until the time is up
     assert (rows.interventions > 0).all()
-    free = run(jax.random.key(0), POLICIES["probe, no shield"][0](), eager, 50, batch=50)
-    assert free.danger.sum() == free.causes["pit"].sum() == 50
+    free = run(jax.random.key(0), at(np.inf)(), eager, 11, batch=4)
+    assert free.danger.sum() == free.causes["pit"].sum() == 11
     assert free.interventions.sum() == 0
     np.testing.assert_array_equal(free.score, 3.0)
 
 
 def test_the_same_key_gives_the_same_episodes_and_another_round_others():
-    values = POLICIES["probe, at random"][1]
-    one, two, other = (run(jax.random.key(k), PROBE, values, 11, batch=4) for k in (1, 1, 2))
+    one, two, other = (run(jax.random.key(k), PROBE, wander, 11, batch=4) for k in (1, 1, 2))
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
         np.testing.assert_array_equal(a, b)
     assert not np.array_equal(one.length, other.length)
@@ -205,13 +210,13 @@ def test_learned_values_are_those_of_the_network():
         def apply(weights, encoded):
             return weights * encoded.rest[:, :1]
 
-    percept = PROBE.perceive(jax.vmap(probe.start_at)(jnp.asarray([2.0, 5.0])))
+    percept = jax.jit(PROBE.perceive)(jax.vmap(probe.start_at)(jnp.asarray([2.0, 5.0])))
     np.testing.assert_array_equal(evaluate.greedy(Net, 3.0)(percept), [[6.0], [15.0]])
 
 
 @functools.cache
 def recorded():
-    still = PROBE.replace(params=probe.make_params(slip=0.0), x=jnp.asarray(np.inf, jnp.float32))
+    still = at(np.inf)().replace(params=probe.make_params(slip=0.0))
     starts = jax.vmap(probe.start_at)(jnp.asarray([4.0, 1.0, 3.0]))
 
     def values(percept):
@@ -259,7 +264,7 @@ def test_visited_states_are_many_and_under_way():
 
 
 def test_visited_states_are_reached_by_admissible_actions_only():
-    states = visit(jax.random.key(2), POLICIES["probe, never secure"][0](), 400, 10)
+    states = visit(jax.random.key(2), at(-1.0)(), 400, 10)
     # Where nothing is admissible, the least threatening of equals is the first: to stay.
     assert set(np.unique(states.agent.position[:, 0])) == set(probe.STARTS)
 

@@ -190,6 +190,27 @@ def test_without_a_shield_no_threat_is_learned(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("field", "values"),
+    [
+        ("seeds", (0, -3, 1.5, 10**6)),
+        ("seed", (-1, 2**31)),
+        ("x", (-0.1, float("nan"))),
+        ("penalty", (-1.0, float("inf"))),
+        ("learning_penalty", (-1.0, float("nan"))),
+        ("episodes", (0, -10, 2.5)),
+        ("fidelity", ("text", "")),
+        ("planning", (loop.LoopConfig(steps=7), loop.LoopConfig(num_envs=0))),
+    ],
+)
+def test_settings_out_of_range_are_named(field, values):
+    circuit.Config().validate()
+    circuit.Config(x=float("inf"), learning_penalty=0.0, seed=2**31 - 1001).validate()
+    for value in values:
+        with pytest.raises(ValueError, match=rf"^{field}.* is .*; it must be"):
+            circuit.Config(**{field: value}).validate()
+
+
 def test_no_two_uses_of_seeds_share_a_key():
     streams = (
         *(pipeline.THREAT, pipeline.SUMS, pipeline.PLANNING),

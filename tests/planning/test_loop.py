@@ -1,5 +1,6 @@
 import dataclasses
 import functools
+import types
 
 import jax
 import jax.numpy as jnp
@@ -182,6 +183,34 @@ def test_a_chunk_is_compiled_once_whatever_the_values():
     assert len(TRACED) == before
 
 
+def test_no_key_is_used_twice(monkeypatch):
+    used = []
+
+    def note(key):
+        used.append(tuple(np.asarray(jax.random.key_data(key)).tolist()))
+
+    def act(key, state, *_):
+        note(key)
+        return state, loop.Metrics(*[0.0] * 8)
+
+    def learn(key, state, *_):
+        note(key)
+        return state, 0.0
+
+    nothing = types.SimpleNamespace(add=lambda old, new: old)
+    monkeypatch.setattr(loop, "make_network", lambda *_: None)
+    monkeypatch.setattr(loop, "make_replay", lambda *_: nothing)
+    monkeypatch.setattr(loop, "_oldest", lambda *_: None)
+    monkeypatch.setattr(loop, "interact", act)
+    monkeypatch.setattr(loop, "learn", learn)
+    blank = dict.fromkeys(loop.LoopState._fields, jnp.zeros(()))
+    state = loop.LoopState(**{**blank, "key": jax.random.key(0)})
+    with jax.disable_jit():
+        loop.chunk(state, None, dataclasses.replace(CONFIG, updates=2), 5)
+    assert len(used) == 5 * 3
+    assert len(set(used)) == len(used)
+
+
 def items(state):
     """The transitions in the replay, (n, ...)."""
     assert not state.replay.is_full
@@ -305,7 +334,6 @@ def test_the_paper_s_network_learns_from_the_smallest_prioritised_replay(compile
         CONFIG,
         network="paper",
         learner=learner,
-        updates=2,
         n_step=1,
         replay=64,
         replay_start=33,
@@ -315,7 +343,7 @@ def test_the_paper_s_network_learns_from_the_smallest_prioritised_replay(compile
     pmdp = probe.make_pmdp(probe, PARAMS, 0.5, pool=1)
     state, _ = start(jax.random.key(10), pmdp, config)
     after, metrics = advance(state, pmdp, config, 10)
-    assert after.learner.updates == 20
+    assert after.learner.updates == 10
     assert np.isfinite(metrics.loss)
     assert metrics.loss > 0
     assert metrics.inadmissible == metrics.crashes == 0

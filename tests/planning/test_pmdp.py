@@ -2,7 +2,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import probe
-import pytest
 from quick import compile_soon  # noqa: F401
 
 from rp_jax.envs import circuit
@@ -83,8 +82,8 @@ def test_the_dead_have_no_threat_and_the_living_keep_theirs():
     np.testing.assert_array_equal(some.encoded.rest, all_of_them.encoded.rest)
 
 
-@pytest.mark.parametrize("pool", [1, 8])
-def test_circuit_is_perceived_as_it_is_observed(pool):
+def test_circuit_is_perceived_as_it_is_observed():
+    pool = 8
     params = circuit.make_params("circle")
     pmdp = probe.make_pmdp(circuit, params, x=np.inf, pool=pool)
     start = jax.vmap(circuit.reset, (0, None))(jax.random.split(jax.random.key(0), 3), params)

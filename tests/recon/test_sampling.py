@@ -111,7 +111,7 @@ def test_preferential_draws_follow_their_key(exact):
     assert not np.array_equal(one, other)
 
 
-@each_kind
+@pytest.mark.parametrize(("env", "kind"), KINDS[1:], ids=["wall", "obstacle"])
 def test_half_the_candidates_lie_near_states_where_the_model_errs(env, kind):
     sub = sub_of(env, kind)
     features = uniform(jax.random.key(7), sub, 2000)

@@ -34,6 +34,9 @@ draw = jax.jit(sampling.uniform, static_argnums=2)
 CASES = [(env, kind, s) for env, kind in ((circuit, "wall"), (jam, "obstacle")) for s in STAGES]
 
 
+FITTED = {}  # by environment and way, what was fitted to, one fit after another
+
+
 @functools.cache
 def short(env):
     return env.sub_rmdps(env.make_params(**SHORT[env]))
@@ -46,8 +49,15 @@ def built(env, kind, way):
     prudence = 1.0 if way == "uniform" else 0.01
     states = 150 if way == "uniform" else 300  # in two parts of the same shape
     config = dataclasses.replace(TINY, states=states, sampling=way, prudence=prudence)
-    told = []
-    found = build.build(jax.random.key(0), sub, config, 0.01, lambda *news: told.append(news))
+    told, fitted = [], build.fitted
+
+    def spy(key, sub, data, *rest):
+        FITTED.setdefault((env, way), []).append(data)
+        return fitted(key, sub, data, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build, "fitted", spy)
+        found = build.build(jax.random.key(0), sub, config, 0.01, lambda *news: told.append(news))
     return sub, found, told
 
 
@@ -96,6 +106,16 @@ def test_the_model_is_of_the_asked_size_and_errs_on_the_safe_side(env, kind, way
     assert found.model(features).shape == (10, 15)
     if way == "uniform":
         assert found.model.shift == 0
+
+
+def test_preferential_sampling_fits_to_all_that_was_labelled():
+    for way in STAGES:
+        built(circuit, "wall", way)
+    whole, (scouted, both) = FITTED[circuit, "uniform"], FITTED[circuit, "preferential"]
+    assert [len(data.features) for data in (*whole, scouted, both)] == [150, 150, 300]
+    assert both.threat.shape == (300, 15)
+    np.testing.assert_array_equal(both.features[:150], scouted.features)
+    assert len(np.unique(both.features, axis=0)) == 300
 
 
 def test_the_same_key_builds_the_same_bits():

@@ -7,10 +7,12 @@ from scipy.special import expit
 
 from rp_jax.threat.model import ACTIVATIONS, ThreatModel, ThreatNetwork
 
+call = jax.jit(lambda model, features: model(features))
+
 
 def random_model(hidden=(8, 4), activation="silu", shift=0.0):
     network = ThreatNetwork(hidden, 3, activation)
-    params = network.init(jax.random.key(0), jnp.zeros(3))
+    params = jax.jit(network.init)(jax.random.key(0), jnp.zeros(3))
     scale = jnp.asarray([0.5, 2.0, 10.0])
     return ThreatModel(None, params, scale, jnp.asarray(shift), network)
 
@@ -42,9 +44,9 @@ def test_threats_lie_between_0_and_1_however_far_the_features():
 def test_leading_axes_are_kept(lead):
     model = random_model()
     features = jax.random.normal(jax.random.key(1), (*lead, 3))
-    threat = model(features)
+    threat = call(model, features)
     assert threat.shape == (*lead, 3)
-    rows = [model(row) for row in features.reshape(-1, 3)]
+    rows = [call(model, row) for row in features.reshape(-1, 3)]
     np.testing.assert_allclose(threat.reshape(-1, 3), jnp.stack(rows), rtol=1e-5)
 
 
