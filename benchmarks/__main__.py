@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks import env_step, recon, threat_query, train_step
+from benchmarks import env_step, recon, tabular, threat_query, train_step
 from benchmarks.measure import Row, report
 
 BENCHMARKS: dict[str, Callable[[], list[Row]]] = {
@@ -12,6 +12,7 @@ BENCHMARKS: dict[str, Callable[[], list[Row]]] = {
     "recon": recon.run,
     "threat_query": threat_query.run,
     "train_step": train_step.run,
+    "tabular": tabular.run,
 }
 
 if __name__ == "__main__":

@@ -47,11 +47,7 @@ def main(
         config = tyro.cli(
             type(config), default=config, args=rest, prog=f"python -m {name}", description=text
         )
-        if config.figures and importlib.util.find_spec("matplotlib") is None:
-            raise ValueError(
-                "figures is True; it needs matplotlib (pip install 'rp_jax[plot]'), or say "
-                "--no-figures"
-            )
+        needs_matplotlib(config.figures)
         task, folder = pipeline.prepare(make_task, config, chosen.preset)
     try:
         pipeline.run(task, config, chosen.preset, folder)
@@ -59,6 +55,14 @@ def main(
         console.say(f"interrupted: what was finished is in {folder}", style="yellow")
         raise SystemExit(130) from None
     return folder
+
+
+def needs_matplotlib(figures: bool) -> None:
+    """Raises ValueError if figures are asked for and cannot be drawn."""
+    if figures and importlib.util.find_spec("matplotlib") is None:
+        raise ValueError(
+            "figures is True; it needs matplotlib (pip install 'rp_jax[plot]'), or say --no-figures"
+        )
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 
@@ -32,6 +33,23 @@ def shield(threat: Array, x: Array | float) -> Shield:
     secure = jnp.any(allowed)
     fallback = jnp.arange(threat.shape[0]) == greedy_eta(threat)
     return Shield(admissible=jnp.where(secure, allowed, fallback), secure=secure)
+
+
+def in_single_precision(threat: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Threats rounded up to float32 and thresholds rounded down.
+
+    So that no action is admissible in float32 that is not in float64: T <= x holds whenever it
+    holds for the rounded ones.
+
+    Args:
+        threat: float64, any shape.
+        x: float64, any shape.
+    """
+    threat, x = np.asarray(threat, np.float64), np.asarray(x, np.float64)
+    above, below = threat.astype(np.float32), x.astype(np.float32)
+    above = np.where(above < threat, np.nextafter(above, np.float32(np.inf)), above)
+    below = np.where(below > x, np.nextafter(below, np.float32(-np.inf)), below)
+    return above, below
 
 
 def greedy_eta(threat: Array) -> Array:

@@ -9,7 +9,7 @@ import probe
 import pytest
 from quick import unoptimised
 
-from benchmarks import env_step, measure, recon, setups, threat_query, train_step
+from benchmarks import env_step, measure, recon, setups, tabular, threat_query, train_step
 from benchmarks.measure import Row
 from experiments import circuit, jam
 
@@ -75,11 +75,11 @@ def test_each_benchmark_has_a_command_line_that_is_read_first(tmp_path, monkeypa
 
 
 def test_all_benchmarks_are_run_by_the_package(tmp_path, monkeypatch):
-    for module in (env_step, recon, threat_query, train_step):
+    for module in (env_step, recon, threat_query, train_step, tabular):
         monkeypatch.setattr(module, "run", lambda: [ROW])
     monkeypatch.setattr("sys.argv", ["benchmarks", "--out", str(tmp_path)])
     runpy.run_module("benchmarks", run_name="__main__")
-    names = {"env_step", "recon", "threat_query", "train_step"}
+    names = {"env_step", "recon", "threat_query", "train_step", "tabular"}
     assert {path.stem for path in tmp_path.iterdir()} == names
 
 
@@ -150,3 +150,9 @@ def test_reconnaissance_is_measured(monkeypatch):
 def test_environments_are_measured():
     rows = [sane(row) for row in env_step.run(4)]
     assert len({row.name for row in rows}) == len(rows) == 10
+
+
+def test_solving_cmdps_is_measured_beside_a_linear_program():
+    rows = tabular.run(batches=(2,), programs=2)
+    assert [row.name for row in rows] == ["Algorithm 1", "linear program"]
+    assert all(0 < row.slowest <= row.per_second <= row.fastest for row in rows)

@@ -10,7 +10,7 @@ from matplotlib import image as images
 from matplotlib import pyplot as plt
 from PIL import Image
 
-from rp_jax.plot import curves, maps, scenes
+from rp_jax.plot import curves, maps, scenes, tabular
 
 rng = np.random.default_rng(0)
 
@@ -198,3 +198,36 @@ def test_an_animation_of_one_step_at_any_threshold(x, tmp_path):
     path = tmp_path / "episode.gif"
     scenes.animate(SCENE, episode(1, 1), (-0.02, 0.0, 0.02), TURNS, x, path)
     assert path.stat().st_size > 1000
+
+
+def test_figures_of_finite_cmdps(tmp_path):
+    plt.close("all")
+    threat = rng.uniform(size=(4, 2, 3)) * [[[0, 1, 1]]]
+    tabular.lake(
+        ["SFH", "FFG"], threat, ("left", "down", "right", "up"), "title", tmp_path / "a.png"
+    )
+    rows = [
+        {
+            "variant": variant,
+            "baseline": baseline,
+            "rule": rule,
+            "c": c,
+            "return_mean": None if c < 0.1 else 0.5,
+            "danger": None if c < 0.1 else 0.0,
+            "share": None if c < 0.1 else 0.9,
+        }
+        for variant in ("one", "two")
+        for baseline in ("eta 0", "eta*")
+        for rule in ("paper", "tight")
+        for c in (0.01, 0.1, 1.0)
+    ]
+    optima = [
+        {"variant": v, "c": c, "optimum": c, "lagrangian": None, "lagrangian_danger": None}
+        for v in ("one", "two")
+        for c in (0.01, 0.1, 1.0)
+    ]
+    tabular.budgets(rows, optima, ("eta 0", "eta*"), tmp_path / "b.png")
+    tabular.shares(rows, ("paper", "tight"), tmp_path / "c.png")
+    for name in ("a", "b", "c"):
+        drawn(tmp_path / f"{name}.png")
+    assert plt.get_fignums() == []

@@ -1,0 +1,246 @@
+"""Frozen Lake (figures 2 and 3), solved exactly: what each baseline and threshold rule earns.
+
+python -m experiments.frozen_lake
+"""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from experiments import cli, console, pipeline
+from rp_jax import storage
+from rp_jax.tabular import frozen_lake, oracle, secure, threat, thresholds
+from rp_jax.tabular.cmdp import FiniteCMDP
+from rp_jax.validate import number
+
+BASELINES = ("eta 0", "eta 1", "eta 2", "eta*")
+COLUMNS = ("rule", "c", "x", "return_mean", "share", "danger", "worst_danger")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of the experiment."""
+
+    out: Path | None = None  # folder for results; results/frozen_lake-TIME if not given
+    horizons: tuple[int, ...] = (100, 200)  # steps of an episode
+    c: tuple[float, ...] = (0.01, 0.05, 0.1, 0.2)  # bounds on the danger, in the table
+    curve: tuple[float, ...] = (0.002, 0.005, 0.02, 0.03, 0.07, 0.15, 0.3, 0.5)  # also in figures
+    slip: float = 2 / 3  # probability of moving sideways
+    program: bool = True  # solve one linear program per lake, as a check of the optimum
+    figures: bool = True  # draw; needs matplotlib
+
+    def validate(self) -> None:
+        """Raises ValueError, naming the field, if a value is out of range."""
+        for name in ("horizons", "c"):
+            if not getattr(self, name):
+                raise ValueError(f"{name} is (); it must have at least one value")
+        for horizon in self.horizons:
+            number("horizons", horizon, least=1, most=1000, integer=True)
+        for c in (*self.c, *self.curve):
+            number("c", c, least=0)
+        number("slip", self.slip, least=0, most=1)
+
+
+def solve_all(lakes: FiniteCMDP, c: jax.Array) -> dict[str, Any]:
+    """Every baseline and rule on every lake and bound.
+
+    Args:
+        lakes: (L, ...) CMDPs of one horizon.
+        c: (C,) bounds.
+
+    Returns:
+        by rule, arrays (L, B, C): x, return, danger, and the worst danger inside the sets.
+    """
+
+    def one(lake: FiniteCMDP, policy: jax.Array, c: jax.Array, rule: Any) -> dict[str, Any]:
+        chosen, planned = thresholds.reconnoitre_and_plan(lake, c, policy, rule)
+        worst = secure.worst(lake, chosen.shield.admissible)
+        return {
+            "x": chosen.x,
+            "return_mean": threat.expected(lake, planned),
+            "danger": threat.expected(lake, threat.threat(lake, planned.policy)),
+            "worst_danger": threat.expected(lake, worst),
+        }
+
+    def over(lake: FiniteCMDP, rule: Any) -> dict[str, Any]:
+        etas = threat.policy_iteration(lake, threat.uniform(lake), 2)
+        policies = jnp.stack([*etas, threat.least_threat(lake).policy])
+        over_c = jax.vmap(one, in_axes=(None, None, 0, None))
+        return jax.vmap(over_c, in_axes=(None, 0, None, None))(lake, policies, c, rule)
+
+    return {
+        name: jax.vmap(over, in_axes=(0, None))(lakes, rule)
+        for name, rule in thresholds.RULES.items()
+    }
+
+
+def run(config: Config) -> dict[str, Any]:
+    """The rows of the table, the curves, and what figure 2 shows."""
+    bounds = sorted({*config.c, *config.curve})
+    rows, optima, programs = [], [], []
+    total = len(config.horizons) * (1 + 2 * len(frozen_lake.HOLES))
+    with console.progress("frozen lake") as bar:
+        done = 0
+        for horizon in config.horizons:
+            lakes = [
+                frozen_lake.frozen_lake(holes=holes, horizon=horizon, slip=config.slip)
+                for holes in frozen_lake.HOLES
+            ]
+            bar("", done, total, f"T = {horizon}: rules")
+            together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *lakes)
+            solved = jax.device_get(jax.jit(solve_all)(together, jnp.asarray(bounds)))
+            done += 1
+            for i, (holes, lake) in enumerate(zip(frozen_lake.HOLES, lakes, strict=True)):
+                variant = f"T={horizon}, {holes} holes"
+                bar("", done, total, f"{variant}: all Lagrange multipliers")
+                vertices = oracle.frontier(lake, most=max(bounds))
+                optima += lagrangian_rows(variant, vertices, bounds)
+                best = {c: oracle.mixed(vertices, c) for c in bounds}
+                rows += rule_rows(variant, bounds, best, solved, i)
+                bar("", done + 1, total, f"{variant}: linear program")
+                if config.program:
+                    programs.append(check(variant, lake, config.c[0], best[config.c[0]]))
+                done += 2
+        bar("", total, total)
+    return {"rows": rows, "optima": optima, "programs": programs, "map": threat_map(config)}
+
+
+def rule_rows(
+    variant: str,
+    bounds: Sequence[float],
+    best: Mapping[float, float],
+    solved: Mapping[str, Mapping[str, np.ndarray]],
+    lake: int,
+) -> list[dict[str, Any]]:
+    """A row per rule, baseline and bound; null where the baseline policy is not safe."""
+    rows = []
+    for rule in thresholds.RULES:
+        found = solved[rule]
+        for b, baseline in enumerate(BASELINES):
+            for i, c in enumerate(bounds):
+                values = {name: float(array[lake, b, i]) for name, array in found.items()}
+                # A rule's own condition: its worst policy keeps c. It fails if eta is not safe.
+                safe = values["worst_danger"] <= c + 1e-12
+                row: dict[str, Any] = {"env": "frozen_lake", "variant": variant, "method": "RP"}
+                row |= {"baseline": baseline, "rule": rule, "c": c, "safe_baseline": safe}
+                row |= {name: value if safe else None for name, value in values.items()}
+                share = values["return_mean"] / best[c] if best[c] > 0 else float("nan")
+                rows.append({**row, "optimum": best[c], "share": share if safe else None})
+    return rows
+
+
+def lagrangian_rows(
+    variant: str, vertices: Sequence[oracle.Vertex], bounds: Sequence[float]
+) -> list[dict[str, Any]]:
+    """The exact optimum at each bound, and the best policy of one Lagrange multiplier."""
+    rows = []
+    for c in bounds:
+        single = oracle.unmixed(list(vertices), c)
+        rows.append(
+            {
+                "variant": variant,
+                "c": c,
+                "optimum": oracle.mixed(list(vertices), c),
+                "lagrangian": None if single is None else single.value,
+                "lagrangian_danger": None if single is None else single.danger,
+                "vertices": len(vertices),
+            }
+        )
+    return rows
+
+
+def check(variant: str, lake: FiniteCMDP, c: float, best: float) -> dict[str, Any]:
+    """The linear program's optimum beside the Lagrangian curve's."""
+    began = time.perf_counter()
+    value = oracle.optimum(lake, c).value
+    seconds = time.perf_counter() - began
+    return {
+        "variant": variant,
+        "c": c,
+        "linear_program": value,
+        "lagrangian": best,
+        "difference": value - best,
+        "seconds": seconds,
+    }
+
+
+def threat_map(config: Config) -> dict[str, Any]:
+    """T_0 of eta* on the map, where falling ends the episode, so that threats are probabilities."""
+    horizon = config.horizons[0]
+    lake = frozen_lake.frozen_lake(holes="paper", horizon=horizon, slip=config.slip)
+    action = threat.least_threat(lake).action[0]
+    rows = frozen_lake.MAP_8X8
+    cells = np.asarray(action[: len(rows) * len(rows[0])]).T  # without the end of the episode
+    return {
+        "rows": list(rows),
+        "horizon": horizon,
+        "threat": cells.reshape(len(frozen_lake.ACTIONS), len(rows), len(rows[0])).tolist(),
+    }
+
+
+def show(results: Mapping[str, Any], config: Config) -> None:
+    """The table on the terminal, for the best baseline."""
+    for variant in dict.fromkeys(row["variant"] for row in results["rows"]):
+        rows = [
+            {name: _cell(name, row[name]) for name in COLUMNS}
+            for row in results["rows"]
+            if row["variant"] == variant and row["c"] in config.c and row["baseline"] == "eta*"
+        ]
+        rows.sort(key=lambda row: float(row["c"]))
+        console.table(f"{variant}, baseline eta*", rows, COLUMNS)
+    if results["programs"]:
+        rows = [{**row, "difference": f"{row['difference']:.1e}"} for row in results["programs"]]
+        console.table("the optimum, twice", rows, list(rows[0]))
+
+
+def _cell(name: str, value: Any) -> str:
+    """Small dangers keep their digits; none where the baseline is not safe."""
+    if value is None:
+        return "-"
+    return value if isinstance(value, str) else f"{value:.{3 if 'danger' in name else 4}g}"
+
+
+def plot(results: Mapping[str, Any], folder: Path) -> None:
+    """Figures 2, 3a and 3b, and the rules' shares of the optimum."""
+    from rp_jax.plot import tabular
+
+    shown = results["map"]
+    tabular.lake(
+        shown["rows"],
+        np.asarray(shown["threat"]),
+        frozen_lake.ACTIONS,
+        f"action threat of eta*, T = {shown['horizon']}",
+        folder / "figure_2.png",
+    )
+    tabular.budgets(results["rows"], results["optima"], BASELINES, folder / "figure_3.png")
+    tabular.shares(results["rows"], tuple(thresholds.RULES), folder / "rules.png")
+
+
+def main() -> None:
+    """The command line."""
+    config = tyro.cli(Config, description=__doc__)
+    with cli.bad_input():
+        config.validate()
+        cli.needs_matplotlib(config.figures)
+        folder = storage.new_folder(config.out or pipeline.default_out("frozen_lake", "exact"))
+    with jax.enable_x64(True):
+        results = run(config)
+    settings = {name: str(v) if isinstance(v, Path) else v for name, v in asdict(config).items()}
+    storage.write_json(folder / "config.json", settings)
+    storage.write_json(folder / "table.json", results["rows"])
+    storage.write_json(folder / "results.json", results)
+    show(results, config)
+    if config.figures:
+        plot(results, folder)
+    console.say(f"results: {folder}")
+
+
+if __name__ == "__main__":
+    main()

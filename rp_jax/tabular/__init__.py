@@ -1,0 +1,1 @@
+"""Finite CMDPs, solved exactly: the oracle that the approximate part is judged by."""

@@ -1,0 +1,179 @@
+"""Finite constrained MDPs (equations 1 and 2) as arrays.
+
+S states, A actions. H is the length of the time axis: the horizon T, or 1 for the infinite
+horizon, where everything is stationary.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from rp_jax.validate import number
+
+ROUNDING = 1e-6  # by which given probabilities may miss the sum 1; they are then divided by it
+
+
+class FiniteCMDP(struct.PyTreeNode):
+    """(S, A, r, d, P, P_0) with discounts and horizon. Made by `make`, which checks it."""
+
+    transition: Array  # (S, A, S) P(s' | s, a)
+    reward: Array  # (S, A) r
+    danger: Array  # (S, A) d >= 0
+    start: Array  # (S,) P_0
+    gamma: Array  # () discount of reward, in [0, 1]
+    beta: Array  # () discount of danger, in [0, 1]
+    horizon: int | None = struct.field(pytree_node=False)  # T; None: infinite
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(H, S, A)."""
+        states, actions = self.reward.shape
+        return self.horizon or 1, states, actions
+
+
+def make(
+    transition: Any,
+    reward: Any,
+    danger: Any,
+    start: Any,
+    *,
+    gamma: float,
+    beta: float,
+    horizon: int | None,
+) -> FiniteCMDP:
+    """A checked CMDP.
+
+    Args:
+        transition: (S, A, S), rows sum to 1.
+        reward: (S, A), or (S, A, S) where it depends on the state arrived in.
+        danger: as reward, at least 0.
+        start: (S,) distribution of the first state, or the index of the only one.
+        gamma: discount of reward, in [0, 1], below 1 for the infinite horizon.
+        beta: discount of danger, likewise.
+        horizon: number of steps, or None for the infinite horizon.
+
+    Raises:
+        ValueError: an argument is out of range; the message names it.
+    """
+    kernel = _array("transition", transition)
+    if kernel.ndim != 3 or kernel.shape[0] != kernel.shape[2] or kernel.size == 0:
+        raise ValueError(f"transition has shape {kernel.shape}; it must be (S, A, S), not empty")
+    states, actions, _ = kernel.shape
+    kernel = _distribution("transition", kernel)
+    if isinstance(start, int | np.integer) and not isinstance(start, bool):
+        number("start", int(start), least=0, most=states - 1, integer=True)
+        first = np.eye(states)[start]
+    else:
+        first = _array("start", start)
+        if first.shape != (states,):
+            raise ValueError(f"start has shape {first.shape}; it must be ({states},)")
+        first = _distribution("start", first)
+    signals = {}
+    for name, value in {"reward": reward, "danger": danger}.items():
+        signal = _array(name, value)
+        if signal.shape not in {(states, actions), (states, actions, states)}:
+            raise ValueError(
+                f"{name} has shape {signal.shape}; it must be ({states}, {actions}) or "
+                f"({states}, {actions}, {states})"
+            )
+        signals[name] = signal
+    if signals["danger"].min() < 0:
+        raise ValueError(f"danger has the value {signals['danger'].min()}; it must be at least 0")
+    for name, signal in signals.items():
+        if signal.ndim == 3:
+            signals[name] = (kernel * signal).sum(axis=2)
+    for name, discount in {"gamma": gamma, "beta": beta}.items():
+        number(name, discount, least=0, most=1)
+        if horizon is None and discount == 1:
+            raise ValueError(f"{name} is 1; it must be below 1 for the infinite horizon")
+    if horizon is not None:
+        number("horizon", horizon, least=1, integer=True)
+    return FiniteCMDP(
+        transition=jnp.asarray(kernel),
+        reward=jnp.asarray(signals["reward"]),
+        danger=jnp.asarray(signals["danger"]),
+        start=jnp.asarray(first),
+        gamma=jnp.asarray(gamma, float),
+        beta=jnp.asarray(beta, float),
+        horizon=None if horizon is None else int(horizon),
+    )
+
+
+def from_table(
+    table: Mapping[int, Mapping[int, Sequence[tuple[float, int, float, bool]]]],
+    danger: Any,
+    start: Any,
+    *,
+    gamma: float,
+    beta: float,
+    horizon: int | None,
+) -> FiniteCMDP:
+    """A CMDP from a transition table as gymnasium's toy-text environments hold it.
+
+    Successors that are listed twice are added up. A step that ends the episode earns what it
+    earns and leads to one more state, the last, where nothing is earned and nothing endangers.
+
+    Args:
+        table: table[s][a] lists (probability, next state, reward, ends the episode).
+        danger: (S,) danger of arriving in each state.
+        start: as for `make`, without the state at the end.
+        gamma: as for `make`.
+        beta: as for `make`.
+        horizon: as for `make`.
+
+    Raises:
+        ValueError: the table has gaps, or an argument is out of range.
+    """
+    states, actions = len(table), len(table[0]) if 0 in table else 0
+    arriving = _array("danger", danger)
+    if arriving.shape != (states,):
+        raise ValueError(f"danger has shape {arriving.shape}; it must be ({states},)")
+    end = states
+    kernel = np.zeros((states + 1, actions, states + 1))
+    earned, harm = np.zeros((2, states + 1, actions))
+    kernel[end, :, end] = 1.0
+    for state in range(states):
+        for action in range(actions):
+            try:
+                successors = table[state][action]
+            except KeyError:
+                raise ValueError(
+                    f"table has no entry [{state}][{action}]; it must have all of {states} states "
+                    f"and {actions} actions"
+                ) from None
+            for probability, arrival, reward, ends in successors:
+                number(f"table[{state}][{action}]: next state", arrival, least=0, most=states - 1)
+                kernel[state, action, end if ends else arrival] += probability
+                earned[state, action] += probability * reward
+                harm[state, action] += probability * arriving[arrival]
+    if np.ndim(start) == 1:
+        start = np.append(np.asarray(start, float), 0.0)
+    return make(kernel, earned, harm, start, gamma=gamma, beta=beta, horizon=horizon)
+
+
+def _array(name: str, value: Any) -> np.ndarray:
+    """As finite float64."""
+    try:
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is no array of numbers") from None
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} has a value that is not finite")
+    return array
+
+
+def _distribution(name: str, array: np.ndarray) -> np.ndarray:
+    """Checked along the last axis, and divided by its sum."""
+    if array.min() < 0:
+        raise ValueError(f"{name} has the probability {array.min()}; it must be at least 0")
+    total = array.sum(axis=-1, keepdims=True)
+    worst = np.abs(total - 1).argmax()
+    if abs(total.flat[worst] - 1) > ROUNDING:
+        row = np.unravel_index(worst, total.shape)[:-1]
+        where = f"{name}[{', '.join(map(str, row))}]" if row else name
+        raise ValueError(f"{where} sums to {total.flat[worst]}; it must sum to 1")
+    return array / total
