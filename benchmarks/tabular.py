@@ -19,9 +19,7 @@ def solved(cmdp: FiniteCMDP) -> jax.Array:
     And the worst danger that any policy inside can do, as the proof.
     """
     star = threat.least_threat(cmdp)
-    chosen, planned = thresholds.reconnoitre_and_plan(
-        cmdp, C, star.policy, thresholds.by_evaluation
-    )
+    chosen, planned = thresholds.planned(cmdp, C, star.policy, thresholds.by_evaluation)
     worst = secure.worst(cmdp, chosen.shield.admissible)
     return jnp.stack([threat.expected(cmdp, planned), threat.expected(cmdp, worst)])
 

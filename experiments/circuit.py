@@ -44,7 +44,10 @@ def make_task(config: Config) -> pipeline.Task:
     """Environments and threats, checked."""
     if not config.test_tracks:
         raise ValueError("test_tracks is (); it must name at least one track")
-    params = lambda track: circuit.make_params(track, fidelity=config.fidelity)  # noqa: E731
+
+    def params(track: str) -> circuit.Params:
+        return circuit.make_params(track, fidelity=config.fidelity, baseline=config.baseline)
+
     return pipeline.Task(
         name="circuit",
         env=circuit,
@@ -73,7 +76,7 @@ def draw(run: pipeline.Finished) -> None:
         episodes = drawing.play(run, params, starts, int(params.time_limit), None)
         panels.append((variant, scenes.Scene(np.asarray(params.track.walls)), episodes))
     scenes.trajectories(panels, folder / "trajectories.png")
-    if run.pmdp.threats:
+    if run.pmdp.threats is not None:
         bar("still", 2, 3, "threat maps")
         draw_maps(run)
     bar("still", 3, 3)

@@ -77,6 +77,7 @@ def threat_of_one(
         titles: of the panels.
         make: maps relative positions (n, 2) and the panel's number to features (n, F).
     """
+    assert run.pmdp.threats is not None
     model = run.pmdp.threats[kind]
     low, high = np.asarray(model.source.window.lower), np.asarray(model.source.window.upper)
     xs, ys = np.linspace(low[0], high[0], 161), np.linspace(low[1], high[1], 121)
@@ -125,7 +126,9 @@ def threat_of_all(
 
 
 def wall_maps(run: Finished, speeds: Sequence[float]) -> None:
-    """threat_of_one_wall_point.png, the agent at several speeds."""
+    """threat_of_one_wall_point.png, the agent at several speeds; not where walls are joint."""
+    if "wall" not in (run.pmdp.threats or {}):
+        return
     panels = threat_of_one(
         run,
         "wall",

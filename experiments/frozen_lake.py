@@ -60,7 +60,7 @@ def solve_all(lakes: FiniteCMDP, c: jax.Array) -> dict[str, Any]:
     """
 
     def one(lake: FiniteCMDP, policy: jax.Array, c: jax.Array, rule: Any) -> dict[str, Any]:
-        chosen, planned = thresholds.reconnoitre_and_plan(lake, c, policy, rule)
+        chosen, planned = thresholds.planned(lake, c, policy, rule)
         worst = secure.worst(lake, chosen.shield.admissible)
         return {
             "x": chosen.x,
@@ -100,7 +100,7 @@ def run(config: Config) -> dict[str, Any]:
             for i, (holes, lake) in enumerate(zip(frozen_lake.HOLES, lakes, strict=True)):
                 variant = f"T={horizon}, {holes} holes"
                 bar("", done, total, f"{variant}: all Lagrange multipliers")
-                vertices = oracle.frontier(lake, most=max(bounds))
+                vertices = oracle.frontier(lake, upto=max(bounds))
                 optima += lagrangian_rows(variant, vertices, bounds)
                 best = {c: oracle.mixed(vertices, c) for c in bounds}
                 rows += rule_rows(variant, bounds, best, solved, i)
@@ -235,7 +235,8 @@ def main() -> None:
     settings = {name: str(v) if isinstance(v, Path) else v for name, v in asdict(config).items()}
     storage.write_json(folder / "config.json", settings)
     storage.write_json(folder / "table.json", results["rows"])
-    storage.write_json(folder / "results.json", results)
+    others = {name: value for name, value in results.items() if name != "rows"}
+    storage.write_json(folder / "optima.json", others)
     show(results, config)
     if config.figures:
         plot(results, folder)

@@ -51,7 +51,10 @@ def make_task(config: Config) -> pipeline.Task:
     """Environments and threats, checked."""
     if not config.test_obstacles:
         raise ValueError("test_obstacles is (); it must name at least one count")
-    params = lambda n: jam.make_params(n, fidelity=config.fidelity)  # noqa: E731
+
+    def params(n: int) -> jam.Params:
+        return jam.make_params(n, fidelity=config.fidelity, baseline=config.baseline)
+
     return pipeline.Task(
         name="jam",
         env=jam,
@@ -83,7 +86,7 @@ def draw(run: pipeline.Finished) -> None:
         if variant == f"N={run.config.obstacles}" or len(panels) == 1:
             shown = episodes
     scenes.trajectories(panels, folder / "trajectories.png")
-    if run.pmdp.threats:
+    if run.pmdp.threats is not None:
         bar("still", 2, 3, "threat maps")
         draw_maps(run)
     bar("still", 3, 3)

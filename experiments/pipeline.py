@@ -16,7 +16,7 @@ import numpy as np
 import rp_jax
 from experiments import console, tables
 from rp_jax import evaluate, shield, storage
-from rp_jax.envs.base import Env
+from rp_jax.envs.base import BASELINES, Env
 from rp_jax.planning import loop
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.planning.networks import POOLS
@@ -41,11 +41,13 @@ class Config:
     threat: Path | None = None  # folder of a threat function to use again
     x: float = 0.01  # largest admissible threat; inf switches the shield off
     learning_penalty: float = 0.0  # taken off the reward per crash while learning
+    learning_toll: float = 0.0  # likewise, per state without an admissible action
     penalty: float = 50.0  # taken off the return per crash in the tables
     episodes: int = 10_000  # evaluated per case
     figures: bool = True  # draw figures and an animation
     planning: LoopConfig = field(default_factory=LoopConfig)  # the learner
     fidelity: str = "released"  # "released" as the published numbers, "paper" as the text
+    baseline: str = "paper"  # "paper": at random; "plans": braking and evading, walls jointly
 
     def validate(self) -> None:
         """Raises ValueError, naming the field, if a value is out of range."""
@@ -53,9 +55,11 @@ class Config:
         number("seed", self.seed, least=0, most=2**31 - 1001, integer=True)
         number("x", self.x, least=0, infinite=True)
         number("learning_penalty", self.learning_penalty, least=0)
+        number("learning_toll", self.learning_toll, least=0)
         number("penalty", self.penalty, least=0)
         number("episodes", self.episodes, least=1, integer=True)
         one_of("fidelity", self.fidelity, ("released", "paper"))
+        one_of("baseline", self.baseline, BASELINES)
         self.planning.validate("planning")
 
 
@@ -103,14 +107,16 @@ def default_out(task: str, preset: str) -> Path:
     return Path("results") / f"{task}-{preset}-{now}"
 
 
-def learn_threats(task: Task, config: Config, folder: Path) -> tuple[dict, dict, dict]:
+def learn_threats(task: Task, config: Config, folder: Path) -> tuple[dict | None, dict, dict]:
     """The threat models of all kinds of hazard: loaded, or learned and saved.
 
     Returns:
-        (models, curves, timings), the latter two empty if loaded.
+        (models, curves, timings), the latter two empty if loaded; None for no shield.
     """
     subs = task.env.sub_rmdps(task.train)
     if np.isinf(config.x):
+        return None, {}, {}
+    if not subs:
         return {}, {}, {}
     if config.threat is not None:
         return artefact.load(config.threat, task.name, subs), {}, {}
@@ -161,13 +167,14 @@ def sum_reports(key: jax.Array, task: Task, config: Config, models: Mapping) -> 
     return found
 
 
-def make_pmdp(task: Task, config: Config, models: Mapping, params: Any) -> PMDP:
+def make_pmdp(task: Task, config: Config, models: Mapping | None, params: Any) -> PMDP:
     """The P-MDP of one variant of the task."""
     return PMDP(
         params=params,
-        threats=dict(models),
+        threats=None if models is None else dict(models),
         x=jnp.asarray(config.x, jnp.float32),
         penalty=jnp.asarray(config.learning_penalty, jnp.float32),
+        toll=jnp.asarray(config.learning_toll, jnp.float32),
         env=task.env,
         pool=POOLS[config.planning.network],
     )
@@ -177,11 +184,11 @@ def method_name(config: Config) -> str:
     """RP with its threshold, or DQN with its penalty."""
     if np.isinf(config.x):
         return f"DQN (penalty {config.learning_penalty:g})"
-    name = f"RP (x={config.x:g})"
+    name = f"RP (x={config.x:g})" if config.baseline == "paper" else f"RP, plans (x={config.x:g})"
     return name if config.learning_penalty == 0 else f"{name[:-1]}, {config.learning_penalty:g})"
 
 
-def plan(task: Task, config: Config, models: Mapping, folder: Path) -> Trained:
+def plan(task: Task, config: Config, models: Mapping | None, folder: Path) -> Trained:
     """Trains all seeds as one program; writes metrics.jsonl as it goes."""
     planning = config.planning
     warm = -(-planning.replay_start // planning.num_envs)  # iterations before learning
@@ -262,7 +269,7 @@ def _append_lines(path: Path, rows: Sequence[Mapping]) -> None:
 
 
 def evaluate_all(
-    task: Task, config: Config, models: Mapping, trained: Trained
+    task: Task, config: Config, models: Mapping | None, trained: Trained
 ) -> list[dict[str, Any]]:
     """One row per variant and seed."""
     pmdp = make_pmdp(task, config, models, task.train)

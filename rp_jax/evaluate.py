@@ -60,7 +60,8 @@ def run_episodes(
         states = jax.vmap(pmdp.env.reset, (0, None))(starts, pmdp.params)
         zeros = jnp.zeros(batch, pmdp.x.dtype)
         none = jnp.zeros(batch, bool)
-        causes = dict.fromkeys(pmdp.env.sub_rmdps(pmdp.params), none)
+        kinds = jax.eval_shape(jax.vmap(pmdp.env.causes, (0, None)), states, pmdp.params)
+        causes = dict.fromkeys(kinds, none)
         count = jnp.zeros(batch, jnp.int32)
         rows = Episodes(zeros, zeros, none, count, count, count, causes)
 

@@ -87,7 +87,7 @@ def reach(agent: AgentModel, horizon: int) -> tuple[np.ndarray, np.ndarray]:
     Covers every sequence of actions and baseline controls, from every speed.
     """
     turns = [np.abs(np.asarray(angle_of(agent.actions.rotation))).max()]
-    turns.append(np.abs(np.asarray(angle_of(agent.baseline.controls.rotation))).max())
+    turns.append(np.abs(np.asarray(angle_of(agent.baseline.rotations))).max())
     slow, fast = float(agent.speeds[0]), float(agent.speeds[-1])
     lower, upper = np.zeros(2), np.zeros(2)
     for k in range(horizon):

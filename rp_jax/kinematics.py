@@ -30,6 +30,11 @@ class ControlDistribution(struct.PyTreeNode):
     controls: Control  # (K,) table
     probabilities: Array  # (K,) sums to one
 
+    @property
+    def rotations(self) -> Array:
+        """(K, 2) every turn it may take."""
+        return self.controls.rotation
+
     def sample(self, key: Array, shape: tuple[int, ...] = ()) -> Control:
         """Draws controls of the given shape, by inverting the cumulative distribution."""
         uniform = jax.random.uniform(key, shape, self.probabilities.dtype)
@@ -39,14 +44,69 @@ class ControlDistribution(struct.PyTreeNode):
         return jax.tree.map(lambda table: table[index], self.controls)
 
 
+class Plans(struct.PyTreeNode):
+    """Several deterministic baseline policies, each a function of the agent alone.
+
+    A plan turns by the same angle at every step; its speed goes to a target for some steps, and
+    then to a halt.
+    """
+
+    rotation: Array  # (K, 2) (cos, sin) of the turn, one that the actions offer
+    target: Array  # (K,) speed to go to at first, room units / step
+    steps: Array  # (K,) int32, how long; from then on the target is 0
+    strongest: Array  # () greatest change of speed in a step
+    horizon: int = struct.field(pytree_node=False)  # steps after which every plan stands still
+
+    @property
+    def rotations(self) -> Array:
+        """(K, 2) every turn it may take."""
+        return self.rotation
+
+    def control(self, k: int, speed: Array) -> Control:
+        """The command of one plan at its step k; a row of the table, unbatched."""
+        wanted = jnp.where(k < self.steps, self.target, 0.0) - speed
+        return Control(jnp.clip(wanted, -self.strongest, self.strongest), self.rotation)
+
+
+def make_plans(
+    turns: Sequence[float], targets: Sequence[float], steps: int, strongest: float, fastest: float
+) -> Plans:
+    """Braking at once, or after `steps` steps at each target speed, with each of the turns.
+
+    Args:
+        turns: radians a step.
+        targets: speeds, room units a step, beside braking at once.
+        steps: for which a target is kept.
+        strongest: change of speed in a step.
+        fastest: greatest speed, either way.
+    """
+    speeds, waits = (0.0, *targets), (0, *[steps] * len(targets))
+    rotation = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+    braking = int(np.ceil(fastest / strongest - 1e-6))
+    return Plans(
+        rotation=jnp.asarray(np.tile(rotation, (len(speeds), 1)), float),
+        target=jnp.asarray(np.repeat(speeds, len(turns)), float),
+        steps=jnp.asarray(np.repeat(waits, len(turns)), jnp.int32),
+        strongest=jnp.asarray(strongest, float),
+        # One step for the first action, one for the last move.
+        horizon=1 + max(waits) + braking + 1,
+    )
+
+
 class AgentModel(struct.PyTreeNode):
     """What the agent can do, and the baseline policy eta^(o) its threat is measured under."""
 
     actions: Control  # (A,) table of discrete actions
-    baseline: ControlDistribution  # eta^(o), a function of the agent alone (Theorem 3)
+    baseline: ControlDistribution | Plans  # eta^(o), functions of the agent alone (Theorem 3)
     speeds: Array  # (S,) the speeds reachable from rest, ascending; the ends are the limits
     delayed: bool = struct.field(pytree_node=False, default=True)  # a control moves the agent
     # only one step later, as in `advance`: exact enumeration may then skip the last control
+
+    @property
+    def num_threats(self) -> int:
+        """Threats of a state: one per action, or one per plan and action (plans count slower)."""
+        plans = len(self.baseline.target) if isinstance(self.baseline, Plans) else 1
+        return plans * len(self.actions.acceleration)
 
     def step(self, vehicle: Vehicle, control: Control) -> Vehicle:
         """The next state of the agent; unbatched in `vehicle` and `control`."""
@@ -98,6 +158,24 @@ def mirrored_actions(actions: Control) -> np.ndarray:
     if (gap.min(axis=-1) > 1e-6).any():
         raise ValueError("actions: the table holds no mirror image of some of its actions")
     return gap.argmin(axis=-1)
+
+
+def mirrored_threats(agent: AgentModel) -> np.ndarray:
+    """(num_threats,) index of the mirror image of each plan and action.
+
+    Raises:
+        ValueError: the actions, or the plans, have no such symmetry.
+    """
+    actions = mirrored_actions(agent.actions)
+    if not isinstance(agent.baseline, Plans):
+        return actions
+    plans, count = agent.baseline, len(actions)
+    columns = [plans.rotation, plans.target[:, None], plans.steps[:, None]]
+    table = np.concatenate([np.asarray(c) for c in columns], axis=-1)
+    gap = np.abs(table[:, None] - table[None] * np.asarray([1, -1, 1, 1])).max(axis=-1)
+    if (gap.min(axis=-1) > 1e-6).any():
+        raise ValueError("baseline: there is no mirror image of some of the plans")
+    return (gap.argmin(axis=-1)[:, None] * count + actions[None]).ravel()
 
 
 def rotate(vector: Array, rotation: Array) -> Array:

@@ -86,6 +86,55 @@ def nearest_of(points: np.ndarray, margin: float, cell: float) -> PointGrid:
     return _pack(points, cell, origin, shape, lists)
 
 
+class DistanceField(struct.PyTreeNode):
+    """Distance to the nearest of fixed points, from a table: one gather, whatever their number.
+
+    Between the corners of a cell it is interpolated, which exceeds the distance to a point (a
+    convex function) by at most cell^2 / (8 distance); less that, it is a lower bound.
+    """
+
+    origin: Array  # (2,) corner of the table, room units
+    cell: Array  # () width of a cell
+    corners: Array  # (nx, ny, 4) distances from a cell's corners: (0, 0), (0, 1), (1, 0), (1, 1)
+    excess: Array  # () greatest error of the interpolation where it matters
+
+    def __call__(self, position: Array) -> Array:
+        """() a lower bound of the distance from `position` (2,), at least as far off as `near`."""
+        place = (position - self.origin) / self.cell
+        limit = jnp.asarray(self.corners.shape[:2], place.dtype)
+        place = jnp.clip(place, 0.0, limit - 1e-3)
+        cell = jnp.floor(place).astype(jnp.int32)
+        u, v = place[0] - cell[0], place[1] - cell[1]
+        c = self.corners[cell[0], cell[1]]
+        near, far = c[0] + v * (c[1] - c[0]), c[2] + v * (c[3] - c[2])
+        return near + u * (far - near) - self.excess
+
+
+def distance_field(
+    points: np.ndarray, near: float, margin: float = 0.5, cell: float = 0.01
+) -> DistanceField:
+    """A table of distances to `points` (P, 2).
+
+    Args:
+        points: room units.
+        near: the bound holds from this distance on.
+        margin: of the table around the points; beyond it, distances are those of its edge.
+        cell: width of a cell.
+    """
+    points = np.asarray(points, float)
+    origin, shape, _ = _cells(points, cell, margin)
+    ij = np.stack(np.meshgrid(*[np.arange(n + 1) for n in shape], indexing="ij"), axis=-1)
+    distance, _ = cKDTree(points).query(origin + ij * cell)
+    corners = [distance[:-1, :-1], distance[:-1, 1:], distance[1:, :-1], distance[1:, 1:]]
+    return DistanceField(
+        origin=jnp.asarray(origin, float),
+        cell=jnp.asarray(cell, float),
+        corners=jnp.asarray(np.stack(corners, axis=-1), float),
+        # Within a cell the distance may be smaller by its diagonal.
+        excess=jnp.asarray(cell**2 / (8 * (near - 1.5 * cell)) + 1e-6, float),
+    )
+
+
 def bin_edges(bins: int) -> Array:
     """Directions (bins + 1, 2) of the edges of equal angular bins, from -pi to pi."""
     angle = np.arange(bins + 1) * (2 * np.pi / bins) - np.pi

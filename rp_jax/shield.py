@@ -49,7 +49,10 @@ def in_single_precision(threat: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, 
     above, below = threat.astype(np.float32), x.astype(np.float32)
     above = np.where(above < threat, np.nextafter(above, np.float32(np.inf)), above)
     below = np.where(below > x, np.nextafter(below, np.float32(-np.inf)), below)
-    return above, below
+    # The smallest numbers are flushed to 0 by compiled code.
+    tiny = np.finfo(np.float32).tiny
+    above = np.where((above > 0) & (above < tiny), tiny, above)
+    return above, np.where((below < 0) & (below > -tiny), -tiny, below)
 
 
 def greedy_eta(threat: Array) -> Array:

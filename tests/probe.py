@@ -118,15 +118,16 @@ def threat_model(params):
     return ThreatModel(params.pit, weights, jnp.ones(3), jnp.zeros(()), ThreatNetwork((), 3))
 
 
-def make_pmdp(env, params, x=0.5, penalty=0.0, models=None, pool=8):
+def make_pmdp(env, params, x=0.5, penalty=0.0, models=None, pool=8, toll=0.0):
     """The probe's P-MDP; the shield is off for x = inf."""
-    if models is None:
-        models = {} if x == float("inf") else {"pit": threat_model(params)}
+    if models is None and x != float("inf"):
+        models = {"pit": threat_model(params)}
     return PMDP(
         params=params,
         threats=models,
         x=jnp.asarray(x, jnp.float32),
         penalty=jnp.asarray(penalty, jnp.float32),
+        toll=jnp.asarray(toll, jnp.float32),
         env=env,
         pool=pool,
     )

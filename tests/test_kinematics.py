@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from rp_jax.envs import jam
 from rp_jax.kinematics import (
     Control,
     ControlDistribution,
@@ -13,8 +14,10 @@ from rp_jax.kinematics import (
     angle_of,
     control_table,
     independent_controls,
+    make_plans,
     make_vehicle,
     mirrored_actions,
+    mirrored_threats,
     rotate,
     squared_distance,
     to_ego,
@@ -173,3 +176,51 @@ def test_more_draws_from_a_key_begin_with_the_fewer():
     key = jax.random.key(2)
     few, many = law.sample(key, (3,)), law.sample(key, (15,))
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[:3]), few, many)
+
+
+PLANS = make_plans((-0.3, 0.0, 0.3), (0.1, -0.1), 3, 0.02, 0.1)
+
+
+def one_plan(k):
+    fields = {name: getattr(PLANS, name)[k] for name in ("rotation", "target", "steps")}
+    return PLANS.replace(**fields)
+
+
+def test_plans_are_all_turns_at_all_targets_braking_first():
+    np.testing.assert_allclose(PLANS.target, np.repeat([0, 0.1, -0.1], 3), atol=1e-7)
+    np.testing.assert_array_equal(PLANS.steps, np.repeat([0, 3, 3], 3))
+    np.testing.assert_allclose(angle_of(PLANS.rotation), np.tile([-0.3, 0, 0.3], 3), atol=1e-6)
+    assert PLANS.horizon == 1 + 3 + 5 + 1
+
+
+@pytest.mark.parametrize("k", range(9))
+@pytest.mark.parametrize("speed", [-0.1, -0.06, 0.0, 0.02, 0.1])
+def test_every_plan_goes_to_its_target_and_then_to_a_halt(k, speed):
+    plan, speeds = one_plan(k), []
+    for j in range(PLANS.horizon - 1):
+        control = plan.control(j, jnp.asarray(speed))
+        assert abs(float(control.acceleration)) <= 0.02 + 1e-7
+        speed = speed + float(control.acceleration)
+        speeds.append(speed)
+    assert abs(speeds[-1]) < 1e-6
+    if k >= 3 and float(plan.target) * speeds[0] > 0:
+        assert abs(speeds[2]) >= abs(speeds[0]) - 1e-6
+
+
+@pytest.mark.parametrize("baseline", ["paper", "plans"])
+def test_mirrored_threats_swap_the_turns_of_plan_and_action(baseline):
+    agent = jam.make_params(1, baseline=baseline).agent
+    order = mirrored_threats(agent)
+    assert len(order) == agent.num_threats == (15 if baseline == "paper" else 135)
+    np.testing.assert_array_equal(order[order], np.arange(len(order)))
+    if baseline == "plans":
+        # Braking to the right after the hardest turn left is mirrored by the opposite.
+        assert order[0 * 15 + 4] == 2 * 15 + 0
+        assert order[1 * 15 + 7] == 1 * 15 + 7  # straight on is its own image
+
+
+def test_mirrored_threats_are_refused_where_a_plan_has_no_mirror_image():
+    agent = jam.make_params(1, baseline="plans").agent
+    lopsided = make_plans((0.0, 0.3), (), 0, 0.02, 0.1)
+    with pytest.raises(ValueError, match="baseline: there is no mirror image"):
+        mirrored_threats(agent.replace(baseline=lopsided))

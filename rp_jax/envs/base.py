@@ -26,6 +26,9 @@ class Outcome(struct.PyTreeNode):
         return self.terminated | self.truncated
 
 
+BASELINES = ("paper", "plans")  # policies that threats are measured under
+
+
 class Hazards(NamedTuple):
     """The hazards of one kind that are present in a state."""
 
@@ -56,6 +59,9 @@ class Env(Protocol):
 
     def causes(self, state: Any, params: Any) -> dict[str, Array]:
         """By kind, () bool: this hazard is being hit in `state`."""
+
+    def clearance(self, position: Array, params: Any) -> Array:
+        """() how far `position` (2,) is from touching a fixed hazard, at most; for plans."""
 
     def sub_rmdps(self, params: Any) -> dict[str, SubRMDP]:
         """By kind, the sub-R-MDP of one hazard."""

@@ -11,10 +11,12 @@ from rp_jax.envs import base, tracks
 from rp_jax.hazards import SubRMDP, WallPoint
 from rp_jax.kinematics import (
     AgentModel,
+    Plans,
     Vehicle,
     angle_of,
     control_table,
     independent_controls,
+    make_plans,
     make_vehicle,
     rotate,
     to_ego,
@@ -43,6 +45,7 @@ class Params(struct.PyTreeNode):
     agent: AgentModel
     wall: WallPoint
     track: tracks.Track
+    walls: sensing.DistanceField | None  # for plans
     edges: Array  # (361, 2) directions of the LIDAR bins' edges
     time_limit: Array  # () int32, steps
     stop_speed: Array  # () slower than this costs 1
@@ -58,6 +61,7 @@ def make_params(
     horizon: int = 5,
     beta: float = 0.999,
     fidelity: str = "released",
+    baseline: str = "paper",
 ) -> Params:
     """The task's parameters, checked.
 
@@ -69,30 +73,37 @@ def make_params(
         beta: discount of danger in the threat.
         fidelity: "released" earns nothing for crossing the lap line, as the published numbers
             did; "paper" counts it as any other progress.
+        baseline: "paper" draws accelerations and turns at random; "plans" brakes, with each turn.
 
     Raises:
         ValueError: a value is out of range, or the track cannot be driven.
     """
     one_of("fidelity", fidelity, FIDELITIES)
+    one_of("baseline", baseline, base.BASELINES)
     positive("time_limit", time_limit, most=10**9, integer=True)
     positive("horizon", horizon, most=100, integer=True)
     positive("radius", radius)
     positive("beta", beta, most=1.0)
     if isinstance(track, str):
         track = tracks.PLANS[one_of("track", track, tracks.PLANS)]()
+    plans = baseline == "plans"
     agent = AgentModel(
         actions=control_table(ACCELERATIONS, TURNS),
-        baseline=independent_controls(
+        baseline=make_plans(TURNS, (), 0, ACCELERATIONS[-1], SPEEDS[-1])
+        if plans
+        else independent_controls(
             ACCELERATIONS, (0.2, 0.6, 0.2), (TURNS[0], 0.0, TURNS[-1]), (0.2, 0.6, 0.2)
         ),
         speeds=jnp.asarray(SPEEDS, float),
     )
     wall = WallPoint.create(agent, radius, horizon)
     corner = np.maximum(np.abs(np.asarray(wall.window.lower)), np.asarray(wall.window.upper))
+    made = tracks.make_track(track, radius, float(np.hypot(*corner)))
     return Params(
         agent=agent,
         wall=wall,
-        track=tracks.make_track(track, radius, float(np.hypot(*corner))),
+        track=made,
+        walls=sensing.distance_field(np.asarray(made.walls), radius) if plans else None,
         edges=sensing.bin_edges(LIDAR_BINS),
         time_limit=jnp.asarray(time_limit, jnp.int32),
         stop_speed=jnp.asarray(0.005, float),
@@ -161,7 +172,9 @@ def observe(state: State, params: Params) -> Array:
 
 
 def hazards(state: State, params: Params) -> dict[str, base.Hazards]:
-    """The wall points near the vehicle."""
+    """The wall points near the vehicle; none under plans, which take all walls together."""
+    if isinstance(params.agent.baseline, Plans):
+        return {}
     points = params.track.walls_in_reach.near(state.agent.position)
     return {"wall": base.Hazards(points, points[:, 0] < sensing.FAR)}
 
@@ -172,8 +185,16 @@ def causes(state: State, params: Params) -> dict[str, Array]:
     return {"wall": jnp.any(jax.vmap(params.wall.hits, (None, 0))(state.agent, points))}
 
 
+def clearance(position: Array, params: Params) -> Array:
+    """() room left between the vehicle at `position` (2,) and the walls; never too much."""
+    assert params.walls is not None
+    return params.walls(position) - params.wall.radius
+
+
 def sub_rmdps(params: Params) -> dict[str, SubRMDP]:
-    """One agent and one wall point."""
+    """One agent and one wall point; none under plans."""
+    if isinstance(params.agent.baseline, Plans):
+        return {}
     return {"wall": SubRMDP(agent=params.agent, source=params.wall, beta=params.beta)}
 
 

@@ -12,10 +12,12 @@ from rp_jax.hazards import MovingObstacle, SubRMDP, WallPoint
 from rp_jax.kinematics import (
     AgentModel,
     Control,
+    Plans,
     Vehicle,
     angle_of,
     control_table,
     independent_controls,
+    make_plans,
     make_vehicle,
     squared_distance,
     to_ego,
@@ -38,6 +40,7 @@ SCALE: tuple[float, ...] = (1.0, 1.0, 1.0, 10.0) * (
 )  # of x, y, heading, speed, for learners
 UNSEEN = (-1.5, -1.51)  # where the observation puts obstacles that do not exist
 FIDELITIES = ("released", "paper")
+EVADING = 3  # steps for which plans drive on or back off before they brake
 
 
 class State(struct.PyTreeNode):
@@ -65,6 +68,7 @@ class Params(struct.PyTreeNode):
     obstacle: MovingObstacle
     start: Vehicle
     goal: Array  # (2,) the point that progress is measured to
+    walls: sensing.DistanceField | None  # for plans
     walls_in_view: sensing.PointGrid
     walls_in_contact: sensing.PointGrid
     walls_in_reach: sensing.PointGrid
@@ -97,6 +101,7 @@ def make_params(
     wall_horizon: int = 5,
     obstacle_horizon: int = 8,
     fidelity: str = "released",
+    baseline: str = "paper",
 ) -> Params:
     """The task's parameters, checked.
 
@@ -110,11 +115,14 @@ def make_params(
         fidelity: "released" rounds progress to whole points and relocates obstacles that leave
             the room or enter a square safety zone; "paper" does not round, and obstacles
             disappear, in quarter circles.
+        baseline: "paper" draws accelerations and turns at random; "plans" brakes, at once or after
+            driving on or backing off, straight on or turning.
 
     Raises:
         ValueError: a value is out of range.
     """
     one_of("fidelity", fidelity, FIDELITIES)
+    one_of("baseline", baseline, base.BASELINES)
     positive("time_limit", time_limit, most=10**9, integer=True)
     positive("radius", radius, most=0.2)
     room = int((ROOM / (2 * radius)) ** 2)  # how many fit, side by side
@@ -122,9 +130,18 @@ def make_params(
     positive("beta", beta, most=1.0)
     positive("wall_horizon", wall_horizon, most=100, integer=True)
     positive("obstacle_horizon", obstacle_horizon, most=100, integer=True)
+    plans = baseline == "plans"
     agent = AgentModel(
         actions=control_table(ACCELERATIONS, TURNS),
-        baseline=independent_controls(
+        baseline=make_plans(
+            (TURNS[0], 0.0, TURNS[-1]),
+            (SPEEDS[-1], SPEEDS[0]),
+            EVADING,
+            ACCELERATIONS[-1],
+            SPEEDS[-1],
+        )
+        if plans
+        else independent_controls(
             ACCELERATIONS, (0.2, 0.6, 0.2), (TURNS[0], 0.0, TURNS[-1]), (0.2, 0.6, 0.2)
         ),
         speeds=jnp.asarray(SPEEDS, float),
@@ -144,6 +161,7 @@ def make_params(
         obstacle=obstacle,
         start=make_vehicle((0.2, 0.2), 0.0, 0.0),
         goal=jnp.asarray((2.6, 3.0), float),
+        walls=sensing.distance_field(walls, radius) if plans else None,
         walls_in_view=sensing.points_within(walls, 1.0, 0.2),
         walls_in_contact=sensing.points_within(walls, radius, 0.1),
         walls_in_reach=sensing.points_within(walls, float(np.hypot(*corner)), 0.2),
@@ -325,12 +343,18 @@ def observe(state: State, params: Params) -> Array:
 
 
 def hazards(state: State, params: Params) -> dict[str, base.Hazards]:
-    """The wall points near the agent, and all obstacles."""
+    """The wall points near the agent, and all obstacles; under plans the obstacles alone."""
+    found = {"obstacle": base.Hazards(state.obstacles, state.present)}
+    if isinstance(params.agent.baseline, Plans):
+        return found
     points = params.walls_in_reach.near(state.agent.position)
-    return {
-        "wall": base.Hazards(points, points[:, 0] < sensing.FAR),
-        "obstacle": base.Hazards(state.obstacles, state.present),
-    }
+    return {"wall": base.Hazards(points, points[:, 0] < sensing.FAR), **found}
+
+
+def clearance(position: Array, params: Params) -> Array:
+    """() room left between the agent at `position` (2,) and the walls; never too much."""
+    assert params.walls is not None
+    return params.walls(position) - params.wall.radius
 
 
 def causes(state: State, params: Params) -> dict[str, Array]:
@@ -342,10 +366,13 @@ def causes(state: State, params: Params) -> dict[str, Array]:
 
 
 def sub_rmdps(params: Params) -> dict[str, SubRMDP]:
-    """One agent and one wall point; one agent and one obstacle."""
+    """One agent and one wall point (not under plans); one agent and one obstacle."""
+    sources = {"wall": params.wall, "obstacle": params.obstacle}
+    if isinstance(params.agent.baseline, Plans):
+        del sources["wall"]
     return {
-        "wall": SubRMDP(agent=params.agent, source=params.wall, beta=params.beta),
-        "obstacle": SubRMDP(agent=params.agent, source=params.obstacle, beta=params.beta),
+        kind: SubRMDP(agent=params.agent, source=source, beta=params.beta)
+        for kind, source in sources.items()
     }
 
 

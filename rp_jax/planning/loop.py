@@ -170,10 +170,11 @@ def interact(
         pmdp.params,
         functools.partial(_look, pmdp),
     )
+    insecure = (jnp.min(seen.threat, axis=-1) > pmdp.x) & ~outcome.terminated
     taken = Taken(
         encoded=state.seen.encoded,
         action=action,
-        reward=outcome.reward - pmdp.penalty * outcome.danger,
+        reward=outcome.reward - pmdp.penalty * outcome.danger - pmdp.toll * insecure,
         terminated=outcome.terminated,
         done=outcome.done,
         next_encoded=seen.encoded,

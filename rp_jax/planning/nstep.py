@@ -15,7 +15,7 @@ class Taken(NamedTuple):
 
     encoded: Encoded
     action: Array  # (B,)
-    reward: Array  # (B,) penalty included
+    reward: Array  # (B,) penalty and toll included
     terminated: Array  # (B,)
     done: Array  # (B,)
     next_encoded: Encoded

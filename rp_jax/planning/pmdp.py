@@ -9,7 +9,9 @@ from jax import Array
 
 from rp_jax import shield
 from rp_jax.envs.base import Env
+from rp_jax.kinematics import Plans
 from rp_jax.threat.model import ThreatModel
+from rp_jax.threat.static import bounded, plan_clearance, static_threat
 from rp_jax.threat.total import total_threat
 
 
@@ -32,14 +34,15 @@ class Percept(NamedTuple):
 class PMDP(struct.PyTreeNode):
     """Equation 10: the original MDP, restricted to the admissible actions.
 
-    A penalised MDP without a shield is the same with x = infinity and a penalty; without threat
-    models nothing is ever forbidden, and no threat is computed.
+    A penalised MDP without a shield is the same with x = infinity and a penalty; with None for
+    threats, none is computed.
     """
 
     params: Any  # of the environment
-    threats: dict[str, ThreatModel]
+    threats: dict[str, ThreatModel] | None  # by kind of hazard; None: nothing is ever forbidden
     x: Array  # () threshold of admissible threat
     penalty: Array  # () taken off the reward per unit of danger while learning
+    toll: Array  # () likewise, per state reached in which no action is admissible
     env: Env = struct.field(pytree_node=False)
     pool: int = struct.field(pytree_node=False, default=8)  # LIDAR bins seen as one
 
@@ -55,8 +58,12 @@ class PMDP(struct.PyTreeNode):
         return Percept(encoded, mask, secure, threat)
 
     def threat(self, states: Any, alive: Array | None = None) -> Array:
-        """(B, A) total threat of a batch of states, 0 where not `alive`."""
-        if not self.threats:
+        """(B, A) total threat of a batch of states, 0 where not `alive`.
+
+        Under several plans, that of the best plan for each action: the least of upper functions
+        (docs/theory.md).
+        """
+        if self.threats is None:
             shape = (states.time.shape[0], self.env.num_actions(self.params))
             return jnp.zeros(shape, self.x.dtype)
         hazards = jax.vmap(self.env.hazards, (0, None))(states, self.params)
@@ -65,7 +72,20 @@ class PMDP(struct.PyTreeNode):
                 kind: group._replace(present=group.present & alive[:, None])
                 for kind, group in hazards.items()
             }
-        return total_threat(self.threats, states.agent, hazards)
+        model = self.params.agent
+        if not isinstance(model.baseline, Plans):
+            return total_threat(self.threats, states.agent, hazards)
+        clear = jax.vmap(
+            lambda agent: plan_clearance(
+                agent, model, lambda position: self.env.clearance(position, self.params)
+            )
+        )(states.agent)
+        threat = static_threat(clear)  # (B, K, A)
+        if hazards:
+            moving = bounded(total_threat(self.threats, states.agent, hazards))
+            threat = threat + moving.reshape(threat.shape)
+        best = jnp.min(threat, axis=1)
+        return best if alive is None else jnp.where(alive[:, None], best, 0.0)
 
 
 def encode(observation: Array, scan: int, pool: int) -> Encoded:

@@ -15,13 +15,14 @@ from flax import struct
 from jax import Array
 
 from rp_jax.hazards import SubRMDP
+from rp_jax.kinematics import ControlDistribution, Plans
 
 
 class Labels(struct.PyTreeNode):
     """Threats and their standard errors."""
 
-    threat: Array  # (A,)
-    stderr: Array  # (A,), 0 where exact, and where all sampled paths agree
+    threat: Array  # (A,); (K * A,) where the baseline is K plans, plans counting slower
+    stderr: Array  # alike, 0 where exact, and where all sampled paths agree
 
 
 # (key, agent, hazard, sub) -> Labels, unbatched.
@@ -36,6 +37,7 @@ def exact_threat(key: Array, agent: Any, hazard: Any, sub: SubRMDP) -> Labels:
     """
     del key
     source, model = sub.source, sub.agent
+    assert isinstance(model.baseline, ControlDistribution)
     controls, probabilities = model.baseline.controls, model.baseline.probabilities
     any_control = jax.tree.map(lambda table: table[0], controls)
 
@@ -68,43 +70,91 @@ def monte_carlo_threat(
     the agent is moved once for all of them.
     """
     source, model = sub.source, sub.agent
+    assert isinstance(model.baseline, ControlDistribution)
     ours, theirs = jax.random.split(key)
     controls = model.baseline.sample(ours, (source.horizon - 1, paths))
     noise = source.draw(theirs, (source.horizon, paths))
 
     def rollout(action: Any, controls: Any, noise: Any) -> Array:
-        """beta^K 1{K <= horizon} of one path."""
-        us, other = agent, hazard
-        hit = source.hits(us, other)
-        value = jnp.where(hit, 1.0, 0.0)
-        weight = jnp.ones_like(value)
-        for k in range(source.horizon):
-            control = action if k == 0 else jax.tree.map(lambda c, k=k: c[k - 1], controls)
-            before, us = us, model.step(us, control)
-            other = source.step(other, before, jax.tree.map(lambda n, k=k: n[k], noise))
-            weight = weight * sub.beta
-            now = source.hits(us, other) & ~hit
-            value = jnp.where(now, weight, value)
-            hit = hit | now
-        return value
+        def control(k: int, us: Any) -> Any:
+            return action if k == 0 else jax.tree.map(lambda c: c[k - 1], controls)
+
+        return _first_hit(agent, hazard, sub, control, noise)
 
     over_actions = jax.vmap(rollout, (0, None, None))
     values = jax.vmap(over_actions, (None, 1, 1))(model.actions, controls, noise)  # (paths, A)
+    return _average(values)
+
+
+def plan_threat(key: Array, agent: Any, hazard: Any, sub: SubRMDP, paths: int = 256) -> Labels:
+    """T_n^{eta_k}(s, a) of every plan k and action a: `paths` rollouts of the hazard.
+
+    The agent's ways are deterministic, and the hazard's the same for all of them.
+    """
+    source, model = sub.source, sub.agent
+    assert isinstance(model.baseline, Plans)
+    noise = source.draw(key, (source.horizon, paths))
+
+    def rollout(plan: Plans, action: Any, noise: Any) -> Array:
+        def control(k: int, us: Any) -> Any:
+            return action if k == 0 else plan.control(k - 1, us.speed)
+
+        return _first_hit(agent, hazard, sub, control, noise)
+
+    plans = model.baseline
+    axes = plans.replace(rotation=0, target=0, steps=0, strongest=None)
+    over_actions = jax.vmap(rollout, (None, 0, None))
+    over_plans = jax.vmap(over_actions, (axes, None, None))
+    values = jax.vmap(over_plans, (None, None, 1))(plans, model.actions, noise)  # (paths, K, A)
+    return _average(values.reshape(paths, -1))
+
+
+def _first_hit(
+    agent: Any, hazard: Any, sub: SubRMDP, control: Callable[[int, Any], Any], noise: Any
+) -> Array:
+    """() beta^K 1{K <= horizon} of one path.
+
+    Args:
+        agent: its first state.
+        hazard: its first state.
+        sub: the sub-R-MDP.
+        control: from the step and the agent's state to its command.
+        noise: (horizon, ...) the hazard's random numbers.
+    """
+    source, us, other = sub.source, agent, hazard
+    hit = source.hits(us, other)
+    value = jnp.where(hit, 1.0, 0.0)
+    weight = jnp.ones_like(value)
+    for k in range(source.horizon):
+        before, us = us, sub.agent.step(us, control(k, us))
+        other = source.step(other, before, jax.tree.map(lambda n, k=k: n[k], noise))
+        weight = weight * sub.beta
+        now = source.hits(us, other) & ~hit
+        value = jnp.where(now, weight, value)
+        hit = hit | now
+    return value
+
+
+def _average(values: Array) -> Labels:
+    """Mean over paths (paths, ...) and its standard error."""
+    paths = values.shape[0]
     spread = jnp.std(values, axis=0, ddof=1) if paths > 1 else jnp.ones(values.shape[1])
     return Labels(threat=jnp.mean(values, axis=0), stderr=spread / jnp.sqrt(paths))
 
 
 def best_estimator(sub: SubRMDP, paths: int) -> Estimator:
     """Exact enumeration where the hazard stays put, Monte Carlo with `paths` rollouts elsewhere."""
+    if isinstance(sub.agent.baseline, Plans):
+        return _sampled(plan_threat, paths)
     if sub.source.static:
         return exact_threat
-    return _sampled(paths)
+    return _sampled(monte_carlo_threat, paths)
 
 
 @functools.cache
-def _sampled(paths: int) -> Estimator:
+def _sampled(estimator: Callable[..., Labels], paths: int) -> Estimator:
     """One object per number of paths, so that `label` compiles once for it."""
-    return functools.partial(monte_carlo_threat, paths=paths)
+    return functools.partial(estimator, paths=paths)
 
 
 @functools.partial(jax.jit, static_argnames=("estimator", "batch"))

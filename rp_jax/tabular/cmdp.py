@@ -59,22 +59,22 @@ def make(
     Raises:
         ValueError: an argument is out of range; the message names it.
     """
-    kernel = _array("transition", transition)
+    kernel = array_of("transition", transition)
     if kernel.ndim != 3 or kernel.shape[0] != kernel.shape[2] or kernel.size == 0:
         raise ValueError(f"transition has shape {kernel.shape}; it must be (S, A, S), not empty")
     states, actions, _ = kernel.shape
-    kernel = _distribution("transition", kernel)
+    kernel = distribution("transition", kernel)
     if isinstance(start, int | np.integer) and not isinstance(start, bool):
         number("start", int(start), least=0, most=states - 1, integer=True)
         first = np.eye(states)[start]
     else:
-        first = _array("start", start)
+        first = array_of("start", start)
         if first.shape != (states,):
             raise ValueError(f"start has shape {first.shape}; it must be ({states},)")
-        first = _distribution("start", first)
+        first = distribution("start", first)
     signals = {}
     for name, value in {"reward": reward, "danger": danger}.items():
-        signal = _array(name, value)
+        signal = array_of(name, value)
         if signal.shape not in {(states, actions), (states, actions, states)}:
             raise ValueError(
                 f"{name} has shape {signal.shape}; it must be ({states}, {actions}) or "
@@ -88,8 +88,11 @@ def make(
             signals[name] = (kernel * signal).sum(axis=2)
     for name, discount in {"gamma": gamma, "beta": beta}.items():
         number(name, discount, least=0, most=1)
-        if horizon is None and discount == 1:
-            raise ValueError(f"{name} is 1; it must be below 1 for the infinite horizon")
+        if horizon is None and jnp.asarray(discount, float) == 1:
+            kind = jnp.asarray(0.0).dtype
+            raise ValueError(
+                f"{name} is {discount}; as {kind} it must be below 1 for the infinite horizon"
+            )
     if horizon is not None:
         number("horizon", horizon, least=1, integer=True)
     return FiniteCMDP(
@@ -128,45 +131,64 @@ def from_table(
     Raises:
         ValueError: the table has gaps, or an argument is out of range.
     """
-    states, actions = len(table), len(table[0]) if 0 in table else 0
-    arriving = _array("danger", danger)
+    try:
+        states, actions = len(table), len(table[0])
+        moves = {
+            (s, a): [(float(p), z, float(r), bool(e)) for p, z, r, e in table[s][a]]
+            for s in range(states)
+            for a in range(len(table[s]))
+        }
+    except (KeyError, IndexError, TypeError, ValueError):
+        raise ValueError(
+            "table is no table; table[s][a], of states s and actions a from 0 on, must list "
+            "(probability, next state, reward, ends the episode)"
+        ) from None
+    if len(moves) != states * actions or any(len(table[s]) != actions for s in range(states)):
+        raise ValueError(
+            f"table has states with other than {actions} actions; all must have as many"
+        )
+    arriving = array_of("danger", danger)
     if arriving.shape != (states,):
         raise ValueError(f"danger has shape {arriving.shape}; it must be ({states},)")
+    if arriving.min() < 0:
+        raise ValueError(f"danger has the value {arriving.min()}; it must be at least 0")
     end = states
     kernel = np.zeros((states + 1, actions, states + 1))
     earned, harm = np.zeros((2, states + 1, actions))
     kernel[end, :, end] = 1.0
-    for state in range(states):
-        for action in range(actions):
-            try:
-                successors = table[state][action]
-            except KeyError:
-                raise ValueError(
-                    f"table has no entry [{state}][{action}]; it must have all of {states} states "
-                    f"and {actions} actions"
-                ) from None
-            for probability, arrival, reward, ends in successors:
-                number(f"table[{state}][{action}]: next state", arrival, least=0, most=states - 1)
-                kernel[state, action, end if ends else arrival] += probability
-                earned[state, action] += probability * reward
-                harm[state, action] += probability * arriving[arrival]
-    if np.ndim(start) == 1:
-        start = np.append(np.asarray(start, float), 0.0)
+    for (state, action), successors in moves.items():
+        where = f"table[{state}][{action}]"
+        for probability, arrival, reward, ends in successors:
+            number(f"{where}: next state", arrival, least=0, most=states - 1, integer=True)
+            number(f"{where}: probability", probability, least=0, most=1)
+            kernel[state, action, end if ends else arrival] += probability
+            earned[state, action] += probability * reward
+            harm[state, action] += probability * arriving[arrival]
+    if isinstance(start, int | np.integer):
+        number("start", int(start), least=0, most=states - 1, integer=True)
+    else:
+        start = array_of("start", start)
+        if start.shape != (states,):
+            raise ValueError(f"start has shape {start.shape}; it must be ({states},)")
+        start = np.append(start, 0.0)
     return make(kernel, earned, harm, start, gamma=gamma, beta=beta, horizon=horizon)
 
 
-def _array(name: str, value: Any) -> np.ndarray:
-    """As finite float64."""
+def array_of(name: str, value: Any) -> np.ndarray:
+    """As float64, finite even in the precision that JAX will hold it in."""
     try:
-        array = np.asarray(value, np.float64)
+        array = np.asarray(value)
+        if np.iscomplexobj(array):
+            raise TypeError
+        array = array.astype(np.float64)
     except (TypeError, ValueError):
         raise ValueError(f"{name} is no array of numbers") from None
-    if not np.isfinite(array).all():
+    if not (np.abs(array) <= float(jnp.finfo(jnp.zeros(()).dtype).max)).all():
         raise ValueError(f"{name} has a value that is not finite")
     return array
 
 
-def _distribution(name: str, array: np.ndarray) -> np.ndarray:
+def distribution(name: str, array: np.ndarray) -> np.ndarray:
     """Checked along the last axis, and divided by its sum."""
     if array.min() < 0:
         raise ValueError(f"{name} has the probability {array.min()}; it must be at least 0")

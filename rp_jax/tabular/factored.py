@@ -11,7 +11,9 @@ from flax import struct
 from jax import Array
 
 from rp_jax.tabular.cmdp import FiniteCMDP
-from rp_jax.tabular.threat import threat
+from rp_jax.tabular.secure import plan, secure
+from rp_jax.tabular.threat import Values, threat
+from rp_jax.tabular.thresholds import certified
 
 
 class Hazard(struct.PyTreeNode):
@@ -26,6 +28,7 @@ class Factored(struct.PyTreeNode):
     """An agent and its hazards."""
 
     agent: Array  # (So, A, So) p(s_o' | s_o, a)
+    reward: Array  # (So, A)
     start: Array  # (So,)
     hazards: Sequence[Hazard]
     beta: Array  # ()
@@ -33,7 +36,7 @@ class Factored(struct.PyTreeNode):
 
 
 def joint(model: Factored) -> FiniteCMDP:
-    """The whole CMDP over (s_o, s_1, ..., s_N), the agent's state counting slowest; no reward."""
+    """The whole CMDP over (s_o, s_1, ..., s_N), the agent's state counting slowest."""
     agents, actions, _ = model.agent.shape
     kernel = model.agent[:, None, :, :, None]  # (So, rest, A, So', rest')
     free = jnp.ones((agents, 1, actions))  # (So, rest, A) no hazard hits
@@ -49,7 +52,7 @@ def joint(model: Factored) -> FiniteCMDP:
     danger = (1 - free).reshape(o * rest, a)
     return FiniteCMDP(
         transition=kernel.reshape(o * rest, a, q * rest),
-        reward=jnp.zeros_like(danger),
+        reward=jnp.repeat(model.reward, rest, axis=0),
         danger=danger,
         start=start,
         gamma=model.beta,
@@ -81,7 +84,7 @@ def sub_threats(model: Factored, policy: Array) -> list[Array]:
     found = []
     for n in range(len(model.hazards)):
         alone = model.replace(hazards=[model.hazards[n]])
-        action = threat(joint(alone), lifted(alone, policy)).action
+        action = threat(sub_rmdp(model, n), lifted(alone, policy)).action
         agents = model.agent.shape[0]
         found.append(action.reshape(len(action), agents, -1, action.shape[-1]))
     return found
@@ -94,6 +97,23 @@ def summed(model: Factored, threats: Sequence[Array]) -> Array:
         total = total[:, :, :, None] + one[:, :, None]
         total = total.reshape(*total.shape[:2], -1, total.shape[-1])
     return total.reshape(len(total), -1, total.shape[-1])
+
+
+def approximate(model: Factored, policy: Array, c: Array | float) -> tuple[Array, Values]:
+    """Algorithm 2 exactly: the best policy inside the secure sets of the sum of sub-threats.
+
+    Args:
+        model: of agent and hazards.
+        policy: eta^(o), (So, A) or (H, So, A).
+        c: bound on the danger of an episode.
+
+    Returns:
+        x, by the certificate (negative: there is none for this c), and the plan.
+    """
+    cmdp = joint(model)
+    total = summed(model, sub_threats(model, policy))
+    x = certified(cmdp, total, c)
+    return x, plan(cmdp, secure(total, x).admissible)
 
 
 def truncation(beta: Array | float, steps: int, worst: Array | float) -> Array:

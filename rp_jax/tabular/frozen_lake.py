@@ -48,7 +48,6 @@ def frozen_lake(
     Raises:
         ValueError: a row's length or letter is wrong, or a number is out of range.
     """
-    one_of("holes", holes, HOLES)
     table, cells = transition_table(rows, holes=holes, slip=slip)
     starts = cells == "S"
     if not starts.any():
@@ -67,8 +66,10 @@ def transition_table(
     rows: Sequence[str], *, holes: str = "released", slip: float = 2 / 3
 ) -> tuple[dict[int, dict[int, list[tuple[float, int, float, bool]]]], np.ndarray]:
     """The lake's moves as gymnasium lists them, and its cells (S,) as letters."""
+    one_of("holes", holes, HOLES)
     number("slip", slip, least=0, most=1)
-    rows = list(rows)
+    if isinstance(rows, str) or not all(isinstance(row, str) for row in rows):
+        raise ValueError(f"rows is {rows!r}; it must be a list of strings")
     if not rows or not rows[0] or any(len(row) != len(rows[0]) for row in rows):
         raise ValueError(f"rows has rows of lengths {[*map(len, rows)]}; they must be alike")
     cells = np.asarray([[*row] for row in rows])

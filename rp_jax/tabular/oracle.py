@@ -36,6 +36,7 @@ def optimum(cmdp: FiniteCMDP, c: float) -> Optimum:
         ValueError: no policy keeps the danger at most c; or the horizon is infinite and the
             discounts differ, where stationary policies are not enough.
     """
+    c = float(c) if np.ndim(c) == 0 and np.isrealobj(c) else c
     number("c", c, least=0, infinite=True)
     horizon, states, actions = cmdp.shape
     gamma, beta = float(cmdp.gamma), float(cmdp.beta)
@@ -134,8 +135,8 @@ def _point(cmdp: FiniteCMDP, policy: Array) -> tuple[Array, Array]:
 
 def frontier(
     cmdp: FiniteCMDP,
-    least: float = 0.0,
-    most: float = np.inf,
+    above: float = 0.0,
+    upto: float = np.inf,
     rounding: float = 1e-9,
     limit: int = 10_000,
 ) -> list[Vertex]:
@@ -147,8 +148,8 @@ def frontier(
 
     Args:
         cmdp: the CMDP.
-        least: only chords that reach above this danger are divided,
-        most: and only those that begin below this one.
+        above: only chords that reach beyond this danger are divided,
+        upto: and only those that begin before this one.
         rounding: a vertex must lie this much above the chord, relative to the values' scale.
         limit: of vertices.
 
@@ -172,23 +173,28 @@ def frontier(
             raise RuntimeError(f"the Lagrangian curve has more than {limit} vertices")
         left, right = open_chords.pop()
         toll, prize = right.value - left.value, right.danger - left.danger
-        if prize <= rounding * scale or toll <= 0 or right.danger < least or left.danger > most:
+        if prize <= rounding * scale or toll <= 0 or right.danger < above or left.danger > upto:
             continue
         size = np.hypot(toll, prize)
         between = vertex(toll / size, prize / size)
-        above = prize * (between.value - left.value) - toll * (between.danger - left.danger)
-        if above / size > rounding * scale:
+        gain = prize * (between.value - left.value) - toll * (between.danger - left.danger)
+        if gain / size > rounding * scale:
             found.append(between)
             open_chords += [(left, between), (between, right)]
-    return _hull(found)
+    return _hull(found, rounding * scale)
 
 
-def _hull(vertices: list[Vertex]) -> list[Vertex]:
-    """By rising danger, without what lies on or below a line between others, or falls."""
+def _hull(vertices: list[Vertex], rounding: float) -> list[Vertex]:
+    """By rising danger, without what lies on or below a line between others, or falls.
+
+    Of vertices whose dangers differ by no more than rounding, only the best.
+    """
     chain: list[Vertex] = []
     for vertex in sorted(vertices, key=lambda v: (v.danger, -v.value)):
         if chain and vertex.value <= chain[-1].value:
             continue
+        if chain and vertex.danger <= chain[-1].danger + rounding:
+            chain.pop()
         while len(chain) > 1 and _below(chain[-2], chain[-1], vertex):
             chain.pop()
         chain.append(vertex)
@@ -203,12 +209,12 @@ def _below(left: Vertex, middle: Vertex, right: Vertex) -> bool:
 def mixed(vertices: list[Vertex], c: float) -> float:
     """The greatest return at danger c, policies mixed by a coin; nan below the least danger."""
     dangers = np.asarray([v.danger for v in vertices])
-    if c < dangers[0]:
+    if c < dangers[0] - TOLERANCE * max(1.0, dangers[0]):
         return float("nan")
     return float(np.interp(c, dangers, [v.value for v in vertices]))
 
 
 def unmixed(vertices: list[Vertex], c: float) -> Vertex | None:
     """The best vertex of danger at most c: what one Lagrange multiplier can reach."""
-    within = [v for v in vertices if v.danger <= c]
+    within = [v for v in vertices if v.danger <= c + TOLERANCE * max(1.0, c)]
     return within[-1] if within else None

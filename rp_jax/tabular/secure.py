@@ -42,7 +42,7 @@ def secure_at_all_times(action_threat: Array, x: Array | float) -> Shield:
 
 
 def secure_by_advantage(threat: Values, y: Array | float) -> Shield:
-    """{a : T_t(s, a) - D_t(s) <= y}, never empty for y >= 0 (docs/theory.md)."""
+    """{a : T_t(s, a) - D_t(s) <= y}, not empty for y >= 0 but for rounding (docs/theory.md)."""
     return secure(threat.action - threat.state[..., None], y)
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from rp_jax import shield
-from rp_jax.tabular.cmdp import FiniteCMDP
+from rp_jax.tabular.cmdp import FiniteCMDP, array_of, distribution
 
 ROUNDS = 1_000  # of policy iteration at most; it ends by itself after few
 
@@ -85,8 +85,22 @@ def solve(
     return jax.tree.map(lambda leaf: leaf[None], found)
 
 
+def check_policy(cmdp: FiniteCMDP, policy: Any) -> Array:
+    """(H, S, A) a policy, given as that or stationary (S, A).
+
+    Raises:
+        ValueError: its shape is another, or a row is no distribution.
+    """
+    rows = array_of("policy", policy)
+    if rows.shape not in (cmdp.shape, cmdp.shape[1:]):
+        raise ValueError(
+            f"policy has shape {rows.shape}; it must be {cmdp.shape[1:]} or {cmdp.shape}"
+        )
+    return jnp.broadcast_to(jnp.asarray(distribution("policy", rows)), cmdp.shape)
+
+
 def evaluate(cmdp: FiniteCMDP, signal: Array, discount: Array, policy: Array) -> Values:
-    """Values of one policy: `solve` without a choice."""
+    """Values of one policy, as `check_policy` would pass it: `solve` without a choice."""
     policy = jnp.broadcast_to(policy, cmdp.shape)
     return solve(cmdp, signal, discount, lambda _, given: given, policy)
 

@@ -13,7 +13,8 @@ from jax import Array
 from rp_jax.shield import Shield
 from rp_jax.tabular import secure as sets
 from rp_jax.tabular.cmdp import FiniteCMDP
-from rp_jax.tabular.threat import Values, expected, greedy, solve, threat
+from rp_jax.tabular.threat import Values, check_policy, expected, greedy, solve, threat
+from rp_jax.validate import number
 
 PAPER, TIGHT = 2.0, 1.0  # factors of Theorems 1 and 2: as printed, and as true
 
@@ -36,7 +37,7 @@ def effective_horizon(beta: Array | float, horizon: int | None) -> Array:
 def corollary_1(cmdp: FiniteCMDP, policy: Array, c: Array | float, factor: float = TIGHT) -> Array:
     """() x of Corollary 1: policies in Pi_G^{eta,x} are safe (equation 6).
 
-    Negative if eta itself is not safe: see `checked`.
+    Negative if eta itself is not safe.
 
     Args:
         cmdp: the CMDP.
@@ -54,19 +55,6 @@ def corollary_2(cmdp: FiniteCMDP, policy: Array, c: Array | float, factor: float
     Arguments as for `corollary_1`; it is greedy-eta that must be safe here.
     """
     return corollary_1(cmdp, greedy(threat(cmdp, policy).action), c, factor)
-
-
-def checked(x: Array | float) -> float:
-    """The threshold, if there is one.
-
-    Raises:
-        ValueError: it is negative, or nan.
-    """
-    if not float(x) >= 0:
-        raise ValueError(
-            f"x is {float(x):g}; it must be at least 0: the baseline policy is not safe at this c"
-        )
-    return float(x)
 
 
 class Certificate(NamedTuple):
@@ -106,22 +94,18 @@ def certified(cmdp: FiniteCMDP, upper: Array, c: Array | float) -> Array:
     """() x that the certificate allows whatever the policy and wherever it goes.
 
     (c - E[m_0]) / sum_k beta^k - max e: for U = T^eta it is Corollary 2 with E[m_0] in place of
-    D^{greedy-eta}. Negative if there is none: see `checked`.
+    D^{greedy-eta}. Negative if there is none.
     """
     least, excess = _excess(cmdp, upper)
     return (c - cmdp.start @ least[0]) / effective_horizon(cmdp.beta, cmdp.horizon) - excess.max()
 
 
-def evaluated(
-    cmdp: FiniteCMDP,
-    upper: Array,
-    c: Array | float,
-    rule: Callable[[Array, Array], Shield] = sets.secure,
-) -> Array:
+def evaluated(cmdp: FiniteCMDP, upper: Array, c: Array | float) -> Array:
     """() the largest x of use whose WORST admissible policy keeps E[D_0] <= c.
 
-    The sets grow only at x equal to a value of `upper`, and the worst danger never falls as
-    they grow; so it is a bisection over the sorted values, exact. Minus infinity (greedy-eta
+    The sets of each step grow only at x equal to a value of `upper`, and the worst danger never
+    falls as they grow; so it is a bisection over the sorted values, exact. (The intersections of
+    equation 5 are not nested, and would not do.) Minus infinity (greedy-eta
     everywhere) if no value will do; nan if greedy-eta itself is not safe.
 
     Args:
@@ -134,7 +118,7 @@ def evaluated(
     values = jnp.sort(upper.ravel())
 
     def safe(x: Array) -> Array:
-        return expected(cmdp, sets.worst(cmdp, rule(upper, x).admissible)) <= c
+        return expected(cmdp, sets.worst(cmdp, sets.secure(upper, x).admissible)) <= c
 
     def halve(bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bounds  # values[low - 1] is safe (or low is 0), values[high] is not (or n)
@@ -200,7 +184,7 @@ RULES = {
 
 def reconnoitre_and_plan(
     cmdp: FiniteCMDP,
-    c: Array | float,
+    c: float,
     policy: Array,
     rule: Callable[[FiniteCMDP, Array, Array | float], Rule] = paper,
 ) -> tuple[Rule, Values]:
@@ -211,6 +195,31 @@ def reconnoitre_and_plan(
         c: bound on the danger of an episode.
         policy: eta; `least_threat(cmdp).policy` is eta*.
         rule: one of RULES.
+
+    Raises:
+        ValueError: c or the policy is out of range, or the baseline policy is not safe: not even
+            greedy-eta keeps the danger at most c, so that there is no threshold.
+    """
+    number("c", c, least=0)
+    policy = check_policy(cmdp, policy)
+    least = expected(cmdp, threat(cmdp, greedy(threat(cmdp, policy).action)))
+    if least > c:
+        raise ValueError(
+            f"c is {c:g}; it must be at least {float(least):g}, the danger of greedy-eta: the "
+            "baseline policy is not safe"
+        )
+    return planned(cmdp, c, policy, rule)
+
+
+def planned(
+    cmdp: FiniteCMDP,
+    c: Array | float,
+    policy: Array,
+    rule: Callable[[FiniteCMDP, Array, Array | float], Rule] = paper,
+) -> tuple[Rule, Values]:
+    """`reconnoitre_and_plan` without its checks, for jit and vmap.
+
+    Where the baseline policy is not safe (x negative or nan), the plan keeps no bound.
     """
     chosen = rule(cmdp, policy, c)
     return chosen, sets.plan(cmdp, chosen.shield.admissible)

@@ -25,7 +25,7 @@ class Instance(NamedTuple):
     cmdp: FiniteCMDP
     eta: Array  # (H, S, A)
     other: Array  # (H, S, A)
-    x: Array  # ()
+    x: Array  # (H,)
     share: Array  # () in [0, 2), from which `_bound` makes c
     noise: Array  # (H, S, A) in [0, 1)
 
@@ -34,10 +34,10 @@ def draw(key: Array, states: int, actions: int, horizon: int | None) -> Instance
     """A random instance of sparse transitions, with ties, absorbing states and free actions.
 
     beta is one of BETAS or uniform; x is 0, a value of the threat itself or just below one, or
-    uniform. In a share of the instances the bounds are reached: eta takes a free action, all
-    others cost the same.
+    uniform, and in a share of the instances another at each step. In a share the bounds are
+    reached: eta takes a free action, all others cost the same.
     """
-    keys = iter(jax.random.split(key, 24))
+    keys = iter(jax.random.split(key, 28))
     shape = (states, actions, states)
     h = horizon or 1
 
@@ -66,11 +66,13 @@ def draw(key: Array, states: int, actions: int, horizon: int | None) -> Instance
     )
     if horizon is None:
         beta = jnp.minimum(beta, NEAR_1)
+    start = simplex(next(keys), jnp.ones(states, bool))
+    start = jnp.where(chance(0.3), jnp.eye(states)[0], start)
     cmdp = FiniteCMDP(
         transition=kernel,
         reward=jnp.zeros(shape[:2]),
         danger=danger,
-        start=simplex(next(keys), jnp.ones(states, bool)),
+        start=start,
         gamma=beta,
         beta=beta,
         horizon=horizon,
@@ -80,12 +82,16 @@ def draw(key: Array, states: int, actions: int, horizon: int | None) -> Instance
     found = threat.threat(cmdp, eta).action
     spread = jax.random.uniform(next(keys), maxval=found.max())
     at_value = jax.random.choice(next(keys), found.ravel()) * jnp.where(chance(0.3), 0.95, 1.0)
+    at_value = jnp.where(chance(0.2), jnp.nextafter(at_value, -jnp.inf), at_value)
     pick = jax.random.uniform(next(keys))
+    x = jnp.select([pick < 0.1, pick < 0.5], [0.0, at_value], spread)
+    by_step = jax.random.uniform(next(keys), (h,), maxval=2.0)
+    x = x * jnp.where(chance(0.3), by_step, jnp.ones(h))
     return Instance(
         cmdp=cmdp,
         eta=eta,
         other=other,
-        x=jnp.select([pick < 0.1, pick < 0.5], [0.0, at_value], spread),
+        x=x,
         share=jax.random.uniform(next(keys), maxval=2.0),
         noise=jax.random.uniform(next(keys), found.shape),
     )
@@ -94,16 +100,38 @@ def draw(key: Array, states: int, actions: int, horizon: int | None) -> Instance
 def _worst_drift(
     cmdp: FiniteCMDP, x: Array, at_secure: Callable, elsewhere: Callable, data: tuple
 ) -> Array:
-    """(H, S) max over policies of E[sum beta^k (d_k - x z_k)]; z is 0 where it is not secure."""
+    """(H, S) max over policies of E[sum beta^k (d_k - x_k z_k)]; z is 0 where it is not secure."""
 
     def back(after: Array, now: tuple) -> tuple[Array, Array]:
-        allowed, given = now
+        (allowed, given), x = now
         action = cmdp.danger + cmdp.beta * (cmdp.transition @ after)
         inside = at_secure(action, allowed.admissible, given, x)
         state = jnp.where(allowed.secure, inside, elsewhere(action, given))
         return state, state
 
-    return jax.lax.scan(back, jnp.zeros(cmdp.shape[1]), data, reverse=True)[1]
+    return jax.lax.scan(back, jnp.zeros(cmdp.shape[1]), (data, x), reverse=True)[1]
+
+
+def _riskiest(action: Array, threats: Array, most: Array) -> Array:
+    """(S, A) the policy of the greatest p.Q among those with p.T <= most (F^eta of equation 6).
+
+    A linear program in one constraint: one action, or a mixture of two.
+
+    Args:
+        action: (S, A) Q.
+        threats: (S, A) T.
+        most: (S,) bound.
+    """
+    actions = action.shape[1]
+    low, high, most = threats[:, :, None], threats[:, None, :], most[:, None, None]
+    crossing = (low <= most) & (high > most)
+    share = jnp.where(crossing, (most - low) / jnp.where(crossing, high - low, 1.0), 0.0)
+    mixed = (1 - share) * action[:, :, None] + share * action[:, None, :]
+    best = jnp.argmax(jnp.where(low <= most, mixed, -jnp.inf).reshape(-1, actions**2), axis=1)
+    part = jnp.take_along_axis(share.reshape(-1, actions**2), best[:, None], axis=1)
+    one, other = jnp.divmod(best, actions)
+    hot = lambda i: jax.nn.one_hot(i, actions, dtype=action.dtype)  # noqa: E731
+    return (1 - part) * hot(one) + part * hot(other)
 
 
 def _drifting(action: Array, admissible: Array, eta: Array, x: Array) -> Array:
@@ -117,52 +145,61 @@ def _drifting(action: Array, admissible: Array, eta: Array, x: Array) -> Array:
     return jnp.sum(kept * jnp.maximum(action, best[:, None]), axis=1) + best * (1 - kept.sum(1))
 
 
+SETS = ("secure", "secure_at_all_times")  # of each step, and of all steps (equation 5)
+
+
 def theorem_1(case: Instance) -> Array:
-    """D^pi <= D^eta + sum beta^{k-t} x E[z_k] for all pi in Pi_G, with factor 1 (finite T)."""
+    """D^pi <= D^eta + sum beta^{k-t} x_k E[z_k] for all pi in Pi_G, with factor 1 (finite T)."""
     cmdp, eta, x = case.cmdp, case.eta, case.x
     found = threat.threat(cmdp, eta)
 
     def outside(action: Array, given: tuple) -> Array:
-        """(S,) max of p.Q over p with p.T <= D: a corner, or a mixture of two actions."""
-        _, t, d = given
-        low, high, d = t[:, :, None], t[:, None, :], d[:, None, None]
-        crossing = (low <= d) & (high > d)
-        share = jnp.where(crossing, (d - low) / jnp.where(crossing, high - low, 1.0), 0.0)
-        mixture = (1 - share) * action[:, :, None] + share * action[:, None, :]
-        return jnp.max(jnp.where(low <= d, mixture, -jnp.inf), axis=(1, 2))
+        _, threats, most = given
+        return jnp.sum(_riskiest(action, threats, most) * action, axis=1)
 
     def inside(action: Array, admissible: Array, given: tuple, x: Array) -> Array:
         return _drifting(action, admissible, given[0], x)
 
-    data = (secure.secure(found.action, x), (eta, found.action, found.state + 1e-12))
-    reached = _worst_drift(cmdp, x, inside, outside, data)
-    return jnp.max(reached - found.state)
+    given = (eta, found.action, found.state + 1e-12)
+    broken = []
+    for rule in SETS:
+        data = (getattr(secure, rule)(found.action, x), given)
+        broken.append(jnp.max(_worst_drift(cmdp, x, inside, outside, data) - found.state))
+    return jnp.maximum(*broken)
 
 
 def theorem_2(case: Instance) -> Array:
-    """D^pi <= D^greedy + sum beta^{k-t} x E[z^g_k] for all pi in Pi (finite T)."""
+    """D^pi <= D^greedy + sum beta^{k-t} x_k E[z^g_k] for all pi in Pi (finite T)."""
     cmdp, x = case.cmdp, case.x
     found = threat.threat(cmdp, case.eta)
     greedy = threat.greedy(found.action)
+    improved = threat.threat(cmdp, greedy).state
 
     def outside(action: Array, greedy: Array) -> Array:
         return jnp.sum(greedy * action, axis=1)
 
-    data = (secure.secure(found.action, x), greedy)
-    reached = _worst_drift(cmdp, x, _drifting, outside, data)
-    improved = threat.threat(cmdp, greedy).state
-    return jnp.maximum(jnp.max(reached - improved), jnp.max(improved - found.action.min(axis=-1)))
+    broken = [jnp.max(improved - found.action.min(axis=-1))]
+    for rule in SETS:
+        data = (getattr(secure, rule)(found.action, x), greedy)
+        broken.append(jnp.max(_worst_drift(cmdp, x, _drifting, outside, data) - improved))
+    return jnp.max(jnp.stack(broken))
 
 
 def _danger(case: Instance, values: threat.Values) -> Array:
     return threat.expected(case.cmdp, values)
 
 
+def _steps(cmdp: FiniteCMDP) -> Array:
+    """() sum of beta^k, term by term."""
+    if cmdp.horizon is None:
+        return 1 / (1 - cmdp.beta)
+    return jnp.sum(cmdp.beta ** jnp.arange(cmdp.horizon))
+
+
 def _bound(case: Instance, danger: Array) -> Array:
-    """() c: at or below the danger, or above it by what makes x the instance's own."""
-    steps = jnp.sum(case.cmdp.beta ** jnp.arange(case.cmdp.horizon or 0))
-    steps = steps if case.cmdp.horizon is not None else 1 / (1 - case.cmdp.beta)
-    return jnp.where(case.share < 0.5, 2 * case.share * danger, danger + case.x * steps)
+    """() c: in a tenth of the instances below the danger; else above by what makes x[0] the x."""
+    above = danger + case.x[0] * _steps(case.cmdp)
+    return jnp.where(case.share < 0.2, 5 * case.share * danger, above)
 
 
 def corollary_1(case: Instance) -> Array:
@@ -171,19 +208,19 @@ def corollary_1(case: Instance) -> Array:
     found = threat.threat(cmdp, case.eta)
     c = _bound(case, _danger(case, found))
     x = thresholds.corollary_1(cmdp, case.eta, c)
-    allowed = secure.secure(found.action, x)
-    # Outside the secure states, eta is in F^eta, and no member of it is worse (Theorem 1).
-    sets = jnp.where(allowed.secure[..., None], allowed.admissible, False)
 
     def choose(action: Array, given: tuple) -> Array:
-        inside, eta = given
-        some = inside.any(axis=1, keepdims=True)
-        return jnp.where(some, secure.most(action, inside | ~some), eta)
+        allowed, threats, most = given
+        inside = secure.most(action, allowed.admissible)
+        return jnp.where(allowed.secure[:, None], inside, _riskiest(action, threats, most))
 
-    reached = threat.solve(cmdp, cmdp.danger, cmdp.beta, choose, (sets, case.eta))
+    broken = []
+    for rule in SETS:
+        data = (getattr(secure, rule)(found.action, x), found.action, found.state + 1e-12)
+        reached = threat.solve(cmdp, cmdp.danger, cmdp.beta, choose, data)
+        broken.append(_danger(case, reached) - c)
     unsafe = _danger(case, found) > c
-    broken = _danger(case, reached) - c
-    return jnp.where(unsafe, jnp.where(x < 0, 0.0, 1.0), broken)
+    return jnp.where(unsafe, jnp.where(x < 0, 0.0, 1.0), jnp.maximum(*broken))
 
 
 def corollary_2(case: Instance) -> Array:
@@ -194,8 +231,8 @@ def corollary_2(case: Instance) -> Array:
     c = _bound(case, safest)
     x = thresholds.corollary_2(cmdp, case.eta, c)
     broken = [
-        _danger(case, secure.worst(cmdp, rule(found.action, x).admissible)) - c
-        for rule in (secure.secure, secure.secure_at_all_times)
+        _danger(case, secure.worst(cmdp, getattr(secure, rule)(found.action, x).admissible)) - c
+        for rule in SETS
     ]
     return jnp.where(safest > c, jnp.where(x < 0, 0.0, 1.0), jnp.maximum(*broken))
 
@@ -220,7 +257,7 @@ def certificate(case: Instance) -> Array:
     for upper in (found, found + 0.3 * case.noise, found * case.noise, case.noise):
         proved = thresholds.certificate(cmdp, upper, x)
         reached = secure.worst(cmdp, secure.secure(upper, x).admissible)
-        c = _bound(case, cmdp.start @ proved.least[0])
+        c = _bound(case, cmdp.start @ proved.least[0]) + _steps(cmdp) * proved.excess.max()
         fixed = thresholds.certified(cmdp, upper, c)
         inside = secure.worst(cmdp, secure.secure(upper, fixed).admissible)
         over = jnp.where(fixed >= 0, _danger(case, inside) - c, 0.0)
@@ -233,8 +270,9 @@ def advantage(case: Instance) -> Array:
     cmdp, y = case.cmdp, case.x
     found = threat.threat(cmdp, case.eta)
     reached = secure.worst(cmdp, secure.secure_by_advantage(found, y).admissible)
-    steps = threat.evaluate(cmdp, jnp.ones_like(cmdp.danger), cmdp.beta, case.eta).state
-    return jnp.max(reached.state - found.state - y * steps)
+    each = jnp.broadcast_to(y[:, None, None], cmdp.shape)
+    room = threat.evaluate(cmdp, each, cmdp.beta, case.eta).state  # sum beta^{k-t} y_k
+    return jnp.max(reached.state - found.state - room)
 
 
 def evaluated(case: Instance) -> Array:
@@ -249,8 +287,8 @@ def evaluated(case: Instance) -> Array:
     def danger(x: Array) -> Array:
         return _danger(case, secure.worst(cmdp, secure.secure(found, x).admissible))
 
-    most = thresholds.corollary_2(cmdp, case.eta, c)
-    behind = jnp.max(jnp.where(found <= most - 1e-9, found, -jnp.inf)) - x
+    proved = thresholds.corollary_2(cmdp, case.eta, c)
+    behind = jnp.max(jnp.where(found <= proved - 1e-9, found, -jnp.inf)) - x
     early = jnp.where(jnp.isfinite(beyond) & (danger(beyond) <= c - 1e-9), 1.0, 0.0)
     return jnp.max(jnp.stack([danger(x) - c, early, behind]))
 
@@ -281,6 +319,7 @@ def draw_factored(
     beta = jax.random.choice(next(keys), jnp.asarray(BETAS))
     model = factored.Factored(
         agent=simplex(states, actions, states),
+        reward=jax.random.normal(jax.random.fold_in(key, 0), (states, actions)),
         start=simplex(states),
         hazards=[
             factored.Hazard(
@@ -296,11 +335,30 @@ def draw_factored(
     return model, simplex(horizon or 1, states, actions)
 
 
-def theorem_3(model: factored.Factored, eta: Array) -> Array:
-    """T^eta <= sum_n T^{eta,n} at every joint state, step and action; a share as `violation`."""
-    whole = threat.threat(factored.joint(model), factored.lifted(model, eta)).action
-    total = factored.summed(model, factored.sub_threats(model, eta))
-    return jnp.max(whole - total) / thresholds.effective_horizon(model.beta, model.horizon)
+def theorem_3(model: factored.Factored, etas: Array, x: Array) -> Array:
+    """T^eta <= sum_n T^{eta,n}; and Algorithm 2's policies, inside the sums' sets, keep c.
+
+    The sum is an upper function of the certificate with no excess, and so is the least sum of
+    several plans. A share, as `violations`.
+
+    Args:
+        model: of agent and hazards.
+        etas: (2, H, So, A) two plans.
+        x: () from which c is made.
+    """
+    cmdp = factored.joint(model)
+    totals, broken = [], []
+    for eta in etas:
+        whole = threat.threat(cmdp, factored.lifted(model, eta)).action
+        totals.append(factored.summed(model, factored.sub_threats(model, eta)))
+        broken.append(jnp.max(whole - totals[-1]))
+    for upper in (totals[0], jnp.minimum(*totals)):
+        excess = thresholds.certificate(cmdp, upper, x).excess
+        c = cmdp.start @ upper.min(axis=-1)[0] + x * _steps(cmdp)
+        allowed = secure.secure(upper, thresholds.certified(cmdp, upper, c)).admissible
+        worst = threat.expected(cmdp, secure.worst(cmdp, allowed))
+        broken += [jnp.max(excess), worst - c]
+    return jnp.max(jnp.stack(broken)) / thresholds.effective_horizon(model.beta, model.horizon)
 
 
 def violations(key: Array, states: int, actions: int, horizon: int | None) -> dict[str, Array]:
@@ -309,13 +367,16 @@ def violations(key: Array, states: int, actions: int, horizon: int | None) -> di
     As a share of the greatest danger an episode can have, so that rounding looks alike for all.
     """
     case = draw(key, states, actions, horizon)
-    most = thresholds.effective_horizon(case.cmdp.beta, horizon)
+    greatest = thresholds.effective_horizon(case.cmdp.beta, horizon)
     checks = [name for name in CHECKS if horizon is not None or name not in FINITE]
-    return {name: CHECKS[name](case) / most for name in checks}
+    return {name: CHECKS[name](case) / greatest for name in checks}
 
 
 def violations_of_theorem_3(
     key: Array, states: int, actions: int, hazards: int, horizon: int | None
 ) -> dict[str, Array]:
     """As `violations`, on one random factored model."""
-    return {"theorem 3": theorem_3(*draw_factored(key, states, actions, hazards, horizon))}
+    model, eta = draw_factored(key, states, actions, hazards, horizon)
+    other = jax.random.dirichlet(jax.random.fold_in(key, 2), jnp.ones(actions), eta.shape[:-1])
+    x = jax.random.uniform(jax.random.fold_in(key, 1), maxval=1.0)
+    return {"theorem 3": theorem_3(model, jnp.stack([eta, other]), x)}

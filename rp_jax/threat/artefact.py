@@ -90,8 +90,7 @@ def _blank(folder: Path, kind: str, facts: Any, sub: SubRMDP) -> ThreatModel:
             f"{folder}: {kind}: activation is {facts.get('activation')!r}; it must be one of "
             f"{sorted(ACTIVATIONS)}"
         )
-    num_actions = sub.agent.actions.acceleration.shape[0]
-    network = ThreatNetwork(tuple(hidden), num_actions, facts["activation"])
+    network = ThreatNetwork(tuple(hidden), sub.agent.num_threats, facts["activation"])
     features = jax.eval_shape(
         lambda key: sub.source.features(*sub.source.sample(key, sub.agent)), jax.random.key(0)
     )

@@ -57,7 +57,7 @@ def labelled_sum(
     """
     inside = np.asarray(_inside(agents, hazards, sub))
     row, column = np.nonzero(inside)
-    total = np.zeros((inside.shape[0], sub.agent.actions.acceleration.shape[0]))
+    total = np.zeros((inside.shape[0], sub.agent.num_threats))
     if len(row):
         agent = jax.tree.map(lambda a: a[row], agents)
         hazard = jax.tree.map(lambda a: a[row, column], hazards.state)

@@ -16,7 +16,9 @@ from rp_jax.hazards import SubRMDP
 ENVS = {
     "circuit": (circuit, lambda: circuit.make_params()),
     "circuit-paper": (circuit, lambda: circuit.make_params("circle", fidelity="paper")),
+    "jam-3-plans": (jam, lambda: jam.make_params(3, baseline="plans")),
     "jam-8": (jam, lambda: jam.make_params(8)),
+    "circuit-plans": (circuit, lambda: circuit.make_params(baseline="plans")),
     "jam-3-paper": (jam, lambda: jam.make_params(3, fidelity="paper")),
 }
 LIMIT, STEPS, ROWS = 25, 300, 7

@@ -45,7 +45,7 @@ def test_the_command_writes_tables_and_figures(tmp_path, monkeypatch, capsys):
     words = ["--out", str(out), "--horizons", "5", "--c", "0.1", "--curve", "0.2"]
     monkeypatch.setattr(sys, "argv", ["frozen_lake", *words])
     frozen_lake.main()
-    names = {"config.json", "table.json", "results.json"}
+    names = {"config.json", "table.json", "optima.json"}
     names |= {"figure_2.png", "figure_3.png", "rules.png"}
     assert {path.name for path in out.iterdir()} == names
     rows = json.loads((out / "table.json").read_text())

@@ -186,7 +186,7 @@ def test_a_saved_threat_function_serves_another_track_and_threshold(finished, tm
 
 def test_without_a_shield_no_threat_is_learned(tmp_path):
     config = circuit.Config(x=float("inf"))
-    assert pipeline.learn_threats(circuit.make_task(config), config, tmp_path) == ({}, {}, {})
+    assert pipeline.learn_threats(circuit.make_task(config), config, tmp_path) == (None, {}, {})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -198,6 +198,8 @@ def test_without_a_shield_no_threat_is_learned(tmp_path):
         ("x", (-0.1, float("nan"))),
         ("penalty", (-1.0, float("inf"))),
         ("learning_penalty", (-1.0, float("nan"))),
+        ("learning_toll", (-1.0, float("inf"))),
+        ("baseline", ("brave", "")),
         ("episodes", (0, -10, 2.5)),
         ("fidelity", ("text", "")),
         ("planning", (loop.LoopConfig(steps=7), loop.LoopConfig(num_envs=0))),

@@ -112,6 +112,21 @@ def test_a_penalty_teaches_to_avoid_the_pit_by_falling_into_it():
     assert found["goal_rate"] == 1
 
 
+def test_a_toll_is_taken_wherever_nothing_is_admissible():
+    _, state, _ = learned("RP")
+    taken = []
+    for toll in (0.0, 2.0):
+        for x in (0.5, -1.0):  # everything secure on the way, and nothing
+            pmdp = probe.make_pmdp(probe, PARAMS, x=x, toll=toll)
+            network = loop.make_network(CONFIG, pmdp)
+            after, _ = loop.interact(jax.random.key(0), state, pmdp, network, CONFIG)
+            taken.append(jax.tree.map(lambda a: np.asarray(a)[-1], after.window))
+    free, free_lost, tolled, tolled_lost = taken
+    np.testing.assert_array_equal(free.reward, tolled.reward)
+    expected = free_lost.reward - 2.0 * ~free_lost.terminated
+    np.testing.assert_array_equal(tolled_lost.reward, expected)
+
+
 def test_without_shield_and_penalty_the_bait_is_taken():
     _, _, metrics = learned("DQN")
     assert metrics.crashes > 500

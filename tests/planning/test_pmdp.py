@@ -4,8 +4,11 @@ import numpy as np
 import probe
 from quick import compile_soon  # noqa: F401
 
-from rp_jax.envs import circuit
-from rp_jax.planning.pmdp import encode
+from rp_jax.envs import circuit, jam
+from rp_jax.planning.pmdp import PMDP, encode
+from rp_jax.threat.model import ThreatModel, ThreatNetwork
+from rp_jax.threat.static import bounded, plan_clearance, static_threat
+from rp_jax.threat.total import total_threat
 
 PARAMS = probe.make_params()
 
@@ -100,9 +103,54 @@ def test_the_threshold_and_the_penalty_can_be_swept():
     pmdp = probe.make_pmdp(probe, PARAMS)
     sweep = pmdp.replace(x=jnp.asarray([0.5, 1e-12, jnp.inf]))
     axes = pmdp.replace(
-        params=None, threats=None, x=0, penalty=None
+        params=None, threats=None, x=0, penalty=None, toll=None
     )  # the same shape, with the axes as leaves
     percepts = jax.jit(jax.vmap(lambda p, s: p.perceive(s), (axes, None)))(sweep, states([5, 6]))
     right = percepts.admissible[:, 0, probe.RIGHT]
     np.testing.assert_array_equal(right, [False, False, True])
     np.testing.assert_array_equal(percepts.secure[:, 0], [True, False, True])
+
+
+def under_plans(env, params, models):
+    zero = jnp.zeros(())
+    return PMDP(params, models, x=jnp.asarray(0.01), penalty=zero, toll=zero, env=env)
+
+
+def test_under_plans_an_action_is_as_good_as_its_best_plan():
+    params = jam.make_params(3, baseline="plans")
+    sub = jam.sub_rmdps(params)["obstacle"]
+    network = ThreatNetwork((8,), sub.agent.num_threats, "silu")
+    weights = jax.tree.map(lambda a: 3 * a, network.init(jax.random.key(0), jnp.zeros(6)))
+    model = ThreatModel(sub.source, weights, jnp.full(6, 3.0), jnp.asarray(-1.0), network)
+    pmdp = under_plans(jam, params, {"obstacle": model})
+    start = jax.vmap(jam.reset, (0, None))(jax.random.split(jax.random.key(1), 5), params)
+    near = start.agent.replace(position=start.obstacles.position[:, 0] + 0.3)
+    start = start.replace(agent=near)
+    found = jax.jit(pmdp.threat)(start)
+    assert found.shape == (5, 15)
+
+    def room(position):
+        return jam.clearance(position, params)
+
+    clear = jax.vmap(lambda agent: plan_clearance(agent, params.agent, room))(start.agent)
+    hazards = jax.vmap(jam.hazards, (0, None))(start, params)
+    moving = bounded(total_threat({"obstacle": model}, start.agent, hazards)).reshape(5, 9, 15)
+    every = np.asarray(static_threat(clear) + moving)
+    np.testing.assert_allclose(found, every.min(axis=1), rtol=1e-5)
+    assert (every.argmin(axis=1) > 0).any()  # braking at once is not always best
+    alive = jnp.asarray([True, False, True, True, False])
+    some = np.asarray(pmdp.threat(start, alive))
+    np.testing.assert_array_equal(some[[1, 4]], 0)
+    np.testing.assert_allclose(some[[0, 2, 3]], found[jnp.asarray([0, 2, 3])], rtol=1e-5)
+
+
+def test_under_plans_walls_need_no_model():
+    params = circuit.make_params(baseline="plans")
+    pmdp = under_plans(circuit, params, {})
+    start = jax.vmap(circuit.reset, (0, None))(jax.random.split(jax.random.key(0), 4), params)
+    ahead = start.agent.replace(position=start.agent.position + 0.19 * start.agent.heading)
+    percept = jax.jit(pmdp.perceive)(start.replace(agent=ahead.replace(speed=jnp.full(4, 0.1))))
+    assert set(np.unique(percept.threat >= 2)) <= {False, True}
+    assert ((percept.threat == 0) | (percept.threat >= 2)).all()
+    assert percept.admissible.any(axis=-1).all()
+    assert not percept.admissible.all()

@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 
 from rp_jax.envs import circuit, jam
-from rp_jax.kinematics import make_vehicle
-from rp_jax.recon.labels import Labels, best_estimator, exact_threat, label, monte_carlo_threat
+from rp_jax.kinematics import independent_controls, make_vehicle
+from rp_jax.recon.labels import (
+    Labels,
+    best_estimator,
+    exact_threat,
+    label,
+    monte_carlo_threat,
+    plan_threat,
+)
 
 WALLS = [(circuit, "threat_truth_circuit_wall"), (jam, "threat_truth_jam_wall")]
 PATHS = 4096  # of the fixture `monte_carlo`
@@ -258,3 +265,35 @@ def test_every_row_is_labelled_with_a_key_of_its_own():
     found = label(jax.random.key(0), agents, points, sub_of(jam, "wall"), noise, rows=16).threat
     assert found.shape == (40, 3)
     assert np.unique(np.asarray(found)).size == 120
+
+
+def test_threats_of_plans_are_those_of_a_slow_loop():
+    """A still obstacle ahead: each plan either meets it at a step, or does not."""
+    sub = jam.sub_rmdps(jam.make_params(1, baseline="plans"))["obstacle"]
+    still = sub.source.replace(behaviour=independent_controls([0.0], [1.0], [0.0], [1.0]))
+    sub = sub.replace(source=still)
+    us, other = make_vehicle((0.0, 0.0), 0.0, 0.08), make_vehicle((0.42, 0.05), 0.0, 0.0)
+    found = plan_threat(jax.random.key(0), us, other, sub, 2)
+    plans, model = sub.agent.baseline, sub.agent
+    assert found.threat.shape == (135,)
+    np.testing.assert_allclose(found.stderr, 0, atol=1e-6)
+    for k in range(9):
+        plan = plans.replace(**{n: getattr(plans, n)[k] for n in ("rotation", "target", "steps")})
+        for a in range(15):
+            vehicle, expected = us, 0.0
+            for j in range(sub.source.horizon):
+                first = jax.tree.map(lambda t, a=a: t[a], model.actions)
+                control = first if j == 0 else plan.control(j - 1, vehicle.speed)
+                vehicle = model.step(vehicle, control)
+                if bool(sub.source.hits(vehicle, other)):
+                    expected = float(sub.beta) ** (j + 1)
+                    break
+            assert found.threat[15 * k + a] == pytest.approx(expected, abs=1e-6)
+    assert 0 < float((np.asarray(found.threat) > 0).mean()) < 1
+
+
+def test_plans_are_labelled_by_rollouts_of_plans():
+    sub = jam.sub_rmdps(jam.make_params(1, baseline="plans"))["obstacle"]
+    chosen = best_estimator(sub, 7)
+    assert chosen.func is plan_threat
+    assert chosen is best_estimator(sub, 7)

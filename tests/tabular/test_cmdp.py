@@ -70,7 +70,8 @@ NEGATIVE[0, 0] = [1.5, -0.5]
         ("beta", float("nan"), "beta is nan; it must be"),
         ("horizon", 0, "horizon is 0; it must be an integer, at least 1"),
         ("horizon", 2.5, "horizon is 2.5; it must be an integer"),
-        ("horizon", None, "beta is 1; it must be below 1 for the infinite horizon"),
+        ("horizon", None, "beta is 1.0; as float64 it must be below 1 for the infinite horizon"),
+        ("reward", np.full((2, 2), 1j), "reward is no array of numbers"),
     ],
 )
 def test_what_is_wrong_is_named(field, value, message):
@@ -98,8 +99,19 @@ def test_successors_listed_twice_are_added_up_and_ends_lead_nowhere():
 @pytest.mark.parametrize(
     ("table", "danger", "message"),
     [
-        ({**TABLE, 1: {}}, [0, 1], r"table has no entry \[1\]\[0\]"),
-        ({0: TABLE[0], 2: TABLE[1]}, [0, 1], r"table has no entry \[1\]\[0\]"),
+        ({**TABLE, 1: {}}, [0, 1], "table has states with other than 1 actions"),
+        ({**TABLE, 1: {**TABLE[1], 1: TABLE[1][0]}}, [0, 1], "table has states with other than 1"),
+        ({0: TABLE[0], 2: TABLE[1]}, [0, 1], "table is no table"),
+        (None, [0, 1], "table is no table"),
+        ({**TABLE, 1: {0: [(1.0, 1)]}}, [0, 1], "table is no table"),
+        ({**TABLE, 1: {0: [(1.0, 1, "prize", False)]}}, [0, 1], "table is no table"),
+        ({**TABLE, 1: {0: [(1.0, 0.5, 0, False)]}}, [0, 1], "next state is 0.5; it must be"),
+        (
+            {**TABLE, 1: {0: [(-0.5, 1, 0, False), (1.5, 1, 0, False)]}},
+            [0, 1],
+            r"table\[1\]\[0\]: probability is -0.5",
+        ),
+        (TABLE, [-1, 1], "danger has the value -1.0"),
         ({**TABLE, 1: {0: [(1.0, 7, 0, False)]}}, [0, 1], "next state is 7; it must be"),
         ({**TABLE, 1: {0: [(0.9, 1, 0, False)]}}, [0, 1], r"transition\[1, 0\] sums to 0.9"),
         (TABLE, [0], r"danger has shape \(1,\); it must be \(2,\)"),
@@ -116,3 +128,23 @@ def test_cmdps_are_solved_side_by_side():
     found = jax.jit(jax.vmap(threat.least_threat))(together)
     for i, model in enumerate(models):
         np.testing.assert_allclose(found.state[i], threat.least_threat(model).state, rtol=1e-12)
+
+
+def test_a_table_may_be_of_lists_and_its_starts_are_its_own_states():
+    lists = [[TABLE[s][0]] for s in range(2)]
+    made = cmdp.from_table(lists, danger=[0.0, 1.0], start=0, **DISCOUNTS)
+    assert made.shape == (5, 3, 1)
+    for start, message in ((2, "start is 2; it must be"), ([1.0], r"must be \(2,\)")):
+        with pytest.raises(ValueError, match=message):
+            cmdp.from_table(TABLE, danger=[0.0, 1.0], start=start, **DISCOUNTS)
+
+
+def test_what_the_precision_cannot_hold_is_an_error():
+    with jax.enable_x64(False):
+        for field, value, message in (
+            ("beta", 1 - 1e-9, "as float32 it must be below 1"),
+            ("danger", np.full((2, 2), 1e300), "danger has a value that is not finite"),
+        ):
+            settings = {**GOOD, "horizon": None, "beta": 0.5, field: value}
+            with pytest.raises(ValueError, match=message):
+                cmdp.make(**settings)

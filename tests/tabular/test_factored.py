@@ -69,7 +69,12 @@ def test_a_baseline_that_sees_the_obstacles_breaks_theorem_3():
         still = jnp.broadcast_to(jnp.eye(2), (1, 2, 2, 2))
         hazards.append(factored.Hazard(still, hits, jnp.asarray([0.0, 1.0])))
     model = factored.Factored(
-        agent=stay, start=jnp.ones(1), hazards=hazards, beta=jnp.ones(()), horizon=2
+        agent=stay,
+        reward=jnp.zeros((1, 2)),
+        start=jnp.ones(1),
+        hazards=hazards,
+        beta=jnp.ones(()),
+        horizon=2,
     )
     seen = []
     for n in range(2):
@@ -81,6 +86,22 @@ def test_a_baseline_that_sees_the_obstacles_breaks_theorem_3():
     both = 3  # the state in which both hazards are there
     assert float(whole[0, both].min()) == pytest.approx(2.0)
     assert float(total[0, both].min()) == pytest.approx(1.0)
+
+
+def test_algorithm_2_plans_inside_the_sum_s_sets():
+    model, eta = drawn(jax.random.key(6), 3, 2, 2, 3)
+    cmdp = factored.joint(model)
+    np.testing.assert_array_equal(cmdp.reward, np.repeat(model.reward, 9, axis=0))
+    total = factored.summed(model, factored.sub_threats(model, eta))
+    c = float(cmdp.start @ total.min(-1)[0]) + 0.6
+    x, planned = factored.approximate(model, eta, c)
+    beta = float(model.beta)
+    assert float(x) == pytest.approx(0.6 / (1 + beta + beta**2))
+    best = np.asarray(planned.policy) > 0
+    chosen = np.where(best, np.asarray(total), 0).sum(-1)
+    assert ((chosen <= float(x)) | (chosen == np.asarray(total).min(-1))).all()
+    done = threat.expected(cmdp, threat.threat(cmdp, planned.policy))
+    assert float(done) <= c
 
 
 def test_truncated_rollouts_need_their_margin():

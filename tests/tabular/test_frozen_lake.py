@@ -68,6 +68,8 @@ def test_the_safe_path_is_the_paper_s():
     [
         (["SF", "G"], {}, r"rows has rows of lengths \[2, 1\]; they must be alike"),
         ([], {}, "rows has rows of lengths"),
+        ("SFG", {}, "rows is 'SFG'; it must be a list of strings"),
+        ([1, 2], {}, r"rows is \[1, 2\]; it must be"),
         (["SX"], {}, "rows: letter is 'X'; it must be one of 'S', 'F', 'H', 'G', '#'"),
         (["FG"], {}, "rows has no S"),
         (["SG"], {"slip": 1.5}, "slip is 1.5; it must be"),

@@ -8,6 +8,8 @@ from cases import counterexample_2, jitted, random_cmdp
 
 from rp_jax.tabular import oracle, threat
 
+least_of = jitted(threat.least_threat)
+
 
 def dangers_and_returns(cmdp):
     """Of every deterministic time-indexed policy."""
@@ -31,9 +33,9 @@ def test_the_program_and_the_lagrangian_curve_are_the_best_of_all_policies(gamma
         vertices = oracle.frontier(cmdp)
         assert vertices[0].danger == pytest.approx(dangers.min(), abs=1e-12)
         assert vertices[-1].value == pytest.approx(values.max(), abs=1e-12)
-        for c in np.quantile(dangers, [0, 0.01, 0.1, 0.4, 1]) + 1e-12:
+        for c in np.quantile(dangers, [0, 0.01, 0.1, 0.4, 1]):
             # The best mixture of two policies, over all pairs.
-            within, over = dangers <= c, dangers > c
+            within, over = dangers <= c + 1e-12, dangers > c + 1e-12
             best = values[within].max()
             if over.any():
                 share = (c - dangers[within][:, None]) / (dangers[over] - dangers[within][:, None])
@@ -64,6 +66,18 @@ def test_the_program_s_policy_does_what_it_says(horizon):
         assert oracle.mixed(oracle.frontier(cmdp), c) == pytest.approx(found.value, abs=1e-7)
 
 
+def test_of_equally_dangerous_policies_the_best_is_the_optimum():
+    """Two of three actions cost the same: dangers are alike but for rounding, returns are not."""
+    for seed in range(30):
+        cmdp = random_cmdp(seed, states=4, actions=3)
+        cmdp = cmdp.replace(danger=jnp.zeros((4, 3)).at[:, :2].set(0.1).at[:, 2].set(0.7))
+        vertices = oracle.frontier(cmdp)
+        least = float(threat.expected(cmdp, least_of(cmdp)))
+        best = oracle.optimum(cmdp, least + 1e-9).value
+        assert oracle.mixed(vertices, least) == pytest.approx(best, abs=1e-6)
+        assert oracle.unmixed(vertices, least).value == pytest.approx(best, abs=1e-6)
+
+
 def test_vertices_rise_ever_less_and_are_their_policies():
     cmdp = random_cmdp(3, states=5, horizon=8)
     vertices = oracle.frontier(cmdp)
@@ -75,7 +89,7 @@ def test_vertices_rise_ever_less_and_are_their_policies():
     for vertex in vertices:
         danger, value = evaluate(cmdp, vertex.policy)
         assert (float(danger), float(value)) == pytest.approx((vertex.danger, vertex.value))
-    part = oracle.frontier(cmdp, most=vertices[2].danger)
+    part = oracle.frontier(cmdp, upto=vertices[2].danger)
     assert oracle.mixed(part, vertices[2].danger) == pytest.approx(vertices[2].value)
     assert len(part) < len(vertices)
 
@@ -104,8 +118,9 @@ def test_corollary_3_feasible_exactly_from_the_least_threat_on():
 
 
 def test_what_cannot_be_solved_is_named():
-    with pytest.raises(ValueError, match="c is -1; it must be"):
+    with pytest.raises(ValueError, match=r"c is -1\.0; it must be"):
         oracle.optimum(random_cmdp(0), -1)
+    assert oracle.optimum(random_cmdp(0), jnp.asarray(9.0)).danger <= 9
     apart = random_cmdp(0, horizon=None, gamma=0.9, beta=0.8)
     for solve in (lambda: oracle.optimum(apart, 1.0), lambda: oracle.frontier(apart)):
         with pytest.raises(ValueError, match=r"beta is 0.8; it must be gamma, 0.9"):
