@@ -118,7 +118,7 @@ def test_an_environment_has_every_function_of_the_contract(name):
     assert all(isinstance(sub, SubRMDP) for sub in subs.values())
     state = jax.eval_shape(env.reset, jax.random.key(0), params)
     assert set(jax.eval_shape(env.hazards, state, params)) == set(subs)
-    assert set(jax.eval_shape(env.causes, state, params)) == set(subs)
+    assert set(jax.eval_shape(env.causes, state, params)) >= set(subs)  # walls may be joint
 
 
 @every_env

@@ -143,7 +143,7 @@ def check_agents(folder, name):
     module = MODULES[name]
     config = module.quick("tuned")
     task = module.make_task(config)
-    pmdp = pipeline.make_pmdp(task, config, {}, task.train)
+    pmdp = pipeline.make_pmdp(task, config, None, task.train)
     network = loop.make_network(config.planning, pmdp)
 
     def example(key):
