@@ -62,6 +62,11 @@ class Plans(struct.PyTreeNode):
         """(K, 2) every turn it may take."""
         return self.rotation
 
+    @property
+    def axes(self) -> "Plans":
+        """`in_axes` of a vmap over the plans."""
+        return self.replace(rotation=0, target=0, steps=0, strongest=None)
+
     def control(self, k: int, speed: Array) -> Control:
         """The command of one plan at its step k; a row of the table, unbatched."""
         wanted = jnp.where(k < self.steps, self.target, 0.0) - speed
@@ -154,9 +159,16 @@ def mirrored_actions(actions: Control) -> np.ndarray:
     """
     acceleration, rotation = np.asarray(actions.acceleration), np.asarray(actions.rotation)
     table = np.concatenate([acceleration[:, None], rotation], axis=-1)
-    gap = np.abs(table[:, None] - table[None] * np.asarray([1, 1, -1])).max(axis=-1)
+    return _images(
+        table, [1, 1, -1], "actions: the table holds no mirror image of some of its actions"
+    )
+
+
+def _images(table: np.ndarray, signs: Sequence[int], missing: str) -> np.ndarray:
+    """(n,) index of the row that each row (n, F) becomes under the signs of its columns."""
+    gap = np.abs(table[:, None] - table[None] * np.asarray(signs)).max(axis=-1)
     if (gap.min(axis=-1) > 1e-6).any():
-        raise ValueError("actions: the table holds no mirror image of some of its actions")
+        raise ValueError(missing)
     return gap.argmin(axis=-1)
 
 
@@ -172,10 +184,9 @@ def mirrored_threats(agent: AgentModel) -> np.ndarray:
     plans, count = agent.baseline, len(actions)
     columns = [plans.rotation, plans.target[:, None], plans.steps[:, None]]
     table = np.concatenate([np.asarray(c) for c in columns], axis=-1)
-    gap = np.abs(table[:, None] - table[None] * np.asarray([1, -1, 1, 1])).max(axis=-1)
-    if (gap.min(axis=-1) > 1e-6).any():
-        raise ValueError("baseline: there is no mirror image of some of the plans")
-    return (gap.argmin(axis=-1)[:, None] * count + actions[None]).ravel()
+    missing = "baseline: there is no mirror image of some of the plans"
+    images = _images(table, [1, -1, 1, 1], missing)
+    return (images[:, None] * count + actions[None]).ravel()
 
 
 def rotate(vector: Array, rotation: Array) -> Array:

@@ -86,13 +86,8 @@ def budgets(
         below.plot(c, c, "k:", label="the bound c")
         below.plot(c, [_number(row["lagrangian_danger"]) for row in best], **one)
         for i, baseline in enumerate(baselines):
-            mine = [
-                row
-                for row in rows
-                if (row["variant"], row["baseline"], row["rule"]) == (variant, baseline, rule)
-            ]
-            style = {"color": COLOURS[i], "marker": MARKERS[i], "markersize": 5, "alpha": 0.8}
-            style |= {"label": baseline}
+            mine = _of(rows, variant, baseline, rule)
+            style = _style(i, baseline)
             above.plot(c, [_number(row["return_mean"]) for row in mine], **style)
             below.plot(c, [_number(row["danger"]) for row in mine], **style)
         above.set_title(variant)
@@ -127,20 +122,9 @@ def shares(
     )
     for axis, variant in zip(np.atleast_1d(axes), variants, strict=True):
         for i, rule in enumerate(rules):
-            mine = [
-                row
-                for row in rows
-                if (row["variant"], row["baseline"], row["rule"]) == (variant, baseline, rule)
-            ]
-            axis.plot(
-                [row["c"] for row in mine],
-                [_number(row["share"]) for row in mine],
-                color=COLOURS[i],
-                marker=MARKERS[i],
-                markersize=5,
-                alpha=0.8,
-                label=rule,
-            )
+            mine = _of(rows, variant, baseline, rule)
+            earned = [_number(row["share"]) for row in mine]
+            axis.plot([row["c"] for row in mine], earned, **_style(i, rule))
         axis.set_xscale("log")
         axis.set_title(variant)
         axis.set_xlabel("bound c")
@@ -148,6 +132,20 @@ def shares(
     np.atleast_1d(axes)[-1].legend(fontsize=8, title="threshold rule")
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def _of(
+    rows: Sequence[Mapping[str, Any]], variant: str, baseline: str, rule: str
+) -> list[Mapping[str, Any]]:
+    """The rows of one line."""
+    wanted = (variant, baseline, rule)
+    return [row for row in rows if (row["variant"], row["baseline"], row["rule"]) == wanted]
+
+
+def _style(i: int, label: str) -> dict[str, Any]:
+    """How the i-th line is drawn."""
+    look = {"color": COLOURS[i], "marker": MARKERS[i], "markersize": 5, "alpha": 0.8}
+    return {**look, "label": label}
 
 
 def _number(value: float | None) -> float:

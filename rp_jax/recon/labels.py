@@ -102,9 +102,8 @@ def plan_threat(key: Array, agent: Any, hazard: Any, sub: SubRMDP, paths: int = 
         return _first_hit(agent, hazard, sub, control, noise)
 
     plans = model.baseline
-    axes = plans.replace(rotation=0, target=0, steps=0, strongest=None)
     over_actions = jax.vmap(rollout, (None, 0, None))
-    over_plans = jax.vmap(over_actions, (axes, None, None))
+    over_plans = jax.vmap(over_actions, (plans.axes, None, None))
     values = jax.vmap(over_plans, (None, None, 1))(plans, model.actions, noise)  # (paths, K, A)
     return _average(values.reshape(paths, -1))
 

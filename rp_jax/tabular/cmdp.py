@@ -64,14 +64,7 @@ def make(
         raise ValueError(f"transition has shape {kernel.shape}; it must be (S, A, S), not empty")
     states, actions, _ = kernel.shape
     kernel = distribution("transition", kernel)
-    if isinstance(start, int | np.integer) and not isinstance(start, bool):
-        number("start", int(start), least=0, most=states - 1, integer=True)
-        first = np.eye(states)[start]
-    else:
-        first = array_of("start", start)
-        if first.shape != (states,):
-            raise ValueError(f"start has shape {first.shape}; it must be ({states},)")
-        first = distribution("start", first)
+    first = _first(start, states)
     signals = {}
     for name, value in {"reward": reward, "danger": danger}.items():
         signal = array_of(name, value)
@@ -164,14 +157,19 @@ def from_table(
             kernel[state, action, end if ends else arrival] += probability
             earned[state, action] += probability * reward
             harm[state, action] += probability * arriving[arrival]
-    if isinstance(start, int | np.integer):
+    first = np.append(_first(start, states), 0.0)
+    return make(kernel, earned, harm, first, gamma=gamma, beta=beta, horizon=horizon)
+
+
+def _first(start: Any, states: int) -> np.ndarray:
+    """(S,) the distribution of the first state, given as that or as an index."""
+    if isinstance(start, int | np.integer) and not isinstance(start, bool):
         number("start", int(start), least=0, most=states - 1, integer=True)
-    else:
-        start = array_of("start", start)
-        if start.shape != (states,):
-            raise ValueError(f"start has shape {start.shape}; it must be ({states},)")
-        start = np.append(start, 0.0)
-    return make(kernel, earned, harm, start, gamma=gamma, beta=beta, horizon=horizon)
+        return np.eye(states)[start]
+    first = array_of("start", start)
+    if first.shape != (states,):
+        raise ValueError(f"start has shape {first.shape}; it must be ({states},)")
+    return distribution("start", first)
 
 
 def array_of(name: str, value: Any) -> np.ndarray:

@@ -113,7 +113,6 @@ def evaluated(cmdp: FiniteCMDP, upper: Array, c: Array | float) -> Array:
         upper: (H, S, A) threats, or threats less the state's (then x is the y of
             `secure_by_advantage`).
         c: bound on the danger of an episode.
-        rule: from `upper` and x to the sets.
     """
     values = jnp.sort(upper.ravel())
 

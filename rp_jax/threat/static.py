@@ -34,8 +34,7 @@ def plan_clearance(agent: Vehicle, model: AgentModel, clearance: Callable[[Array
             least = jnp.minimum(least, clearance(us.position))
         return least
 
-    axes = plans.replace(rotation=0, target=0, steps=0, strongest=None)
-    return jax.vmap(jax.vmap(way, (None, 0)), (axes, None))(plans, model.actions)
+    return jax.vmap(jax.vmap(way, (None, 0)), (plans.axes, None))(plans, model.actions)
 
 
 def static_threat(clearance: Array) -> Array:
