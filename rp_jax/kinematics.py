@@ -113,6 +113,22 @@ class AgentModel(struct.PyTreeNode):
         plans = len(self.baseline.target) if isinstance(self.baseline, Plans) else 1
         return plans * len(self.actions.acceleration)
 
+    def control(self, action: Array) -> Control:
+        """The command of an action: () int, a row of the table; or (2,) float, any in between.
+
+        A continuous action is acceleration and turn, each as a share in [-1, 1] of the table's
+        strongest; greater ones are cut. The threat function speaks of the table's rows alone.
+        """
+        action = jnp.asarray(action)
+        if jnp.issubdtype(action.dtype, jnp.integer):
+            return jax.tree.map(lambda table: table[action], self.actions)
+        share = jnp.clip(action, -1.0, 1.0)
+        turn = share[1] * jnp.max(jnp.abs(angle_of(self.actions.rotation)))
+        return Control(
+            acceleration=share[0] * jnp.max(jnp.abs(self.actions.acceleration)),
+            rotation=jnp.stack([jnp.cos(turn), jnp.sin(turn)]),
+        )
+
     def step(self, vehicle: Vehicle, control: Control) -> Vehicle:
         """The next state of the agent; unbatched in `vehicle` and `control`."""
         return advance(vehicle, control, self.speeds)

@@ -1,3 +1,5 @@
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -6,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from rp_jax.envs import jam
+from rp_jax.envs import circuit, jam
 from rp_jax.kinematics import (
     Control,
     ControlDistribution,
@@ -191,6 +193,20 @@ def test_plans_are_all_turns_at_all_targets_braking_first():
     np.testing.assert_array_equal(PLANS.steps, np.repeat([0, 3, 3], 3))
     np.testing.assert_allclose(angle_of(PLANS.rotation), np.tile([-0.3, 0, 0.3], 3), atol=1e-6)
     assert PLANS.horizon == 1 + 3 + 5 + 1
+
+
+@pytest.mark.parametrize("task", [circuit, jam])
+def test_a_continuous_action_says_what_the_table_says_at_its_rows(task):
+    agent = task.make_params().agent
+    strongest = max(task.ACCELERATIONS), max(task.TURNS)
+    pairs = itertools.product(task.ACCELERATIONS, task.TURNS)
+    for action, (acceleration, turn) in enumerate(pairs):
+        row = agent.control(jnp.asarray(action))
+        share = jnp.asarray([acceleration / strongest[0], turn / strongest[1]])
+        for scale in (1.0, 4.0) if abs(share).min() == 1 else (1.0,):  # greater ones are cut
+            found = agent.control(scale * share)
+            np.testing.assert_allclose(found.acceleration, row.acceleration, atol=1e-7)
+            np.testing.assert_allclose(found.rotation, row.rotation, atol=1e-6)
 
 
 @pytest.mark.parametrize("k", range(9))

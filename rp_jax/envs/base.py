@@ -49,7 +49,7 @@ class Env(Protocol):
         """Draws a start state. Any other state of the same type can be stepped as well."""
 
     def step(self, key: Array, state: Any, action: Array, params: Any) -> tuple[Any, Outcome]:
-        """One transition under `action`, () int."""
+        """One transition under `action`: () int, or floats in [-1, 1] for a continuous one."""
 
     def observe(self, state: Any, params: Any) -> Array:
         """The paper's observation of a state; costs nothing where it is not called."""

@@ -140,7 +140,7 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
     The reward is the number of centre points passed, less 1 when (almost) standing still.
     """
     del key
-    control = jax.tree.map(lambda table: table[action], params.agent.actions)
+    control = params.agent.control(action)
     reached = start_at(params.agent.step(state.agent, control), params)
     reached = reached.replace(time=state.time + 1)
     crashed = causes(reached, params)["wall"]

@@ -258,8 +258,7 @@ def draw(key: Array, state: State, action: Array, params: Params) -> Draws:
 
 
 def _move_agent(state: State, action: Array, params: Params) -> Vehicle:
-    control = jax.tree.map(lambda table: table[action], params.agent.actions)
-    return params.agent.step(state.agent, control)
+    return params.agent.step(state.agent, params.agent.control(action))
 
 
 def _move_obstacles(state: State, controls: Control, params: Params) -> Vehicle:
