@@ -21,6 +21,7 @@ def main(
     presets: Mapping[str, Callable[[str], Any]],
     make_task: Callable[[Any], pipeline.Task],
     argv: Sequence[str] | None = None,
+    run: Callable[[pipeline.Task, Any, str, Path], None] | None = None,
 ) -> Path:
     """Runs an experiment from the command line; exits with 2 on bad input.
 
@@ -30,6 +31,8 @@ def main(
         presets: by name, functions from a recipe's name to a configuration.
         make_task: from a configuration to the task.
         argv: arguments, the process's own if not given.
+        run: does the job with (task, configuration, preset, new folder); `pipeline.run` if not
+            given.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -50,7 +53,7 @@ def main(
         needs_matplotlib(config.figures)
         task, folder = pipeline.prepare(make_task, config, chosen.preset)
     try:
-        pipeline.run(task, config, chosen.preset, folder)
+        (run or pipeline.run)(task, config, chosen.preset, folder)
     except KeyboardInterrupt:
         console.say(f"interrupted: what was finished is in {folder}", style="yellow")
         raise SystemExit(130) from None

@@ -27,7 +27,8 @@ from rp_jax.threat.build import ThreatConfig
 from rp_jax.threat.total import total_threat
 from rp_jax.validate import number, one_of
 
-THREAT, SUMS, PLANNING, EVALUATION, STARTS, MEDIA = range(6)  # streams of random numbers, apart
+# Streams of random numbers, apart.
+THREAT, SUMS, PLANNING, EVALUATION, STARTS, MEDIA, CERTIFICATE, RARE = range(8)
 CHUNKS = 30  # of a training run: points of its curves
 
 
@@ -74,11 +75,19 @@ class Task(NamedTuple):
     draw: Callable[[Any], None] | None  # makes the task's own figures from a `Finished`
 
 
+class Member(NamedTuple):
+    """One of the training runs that go side by side."""
+
+    seed: int
+    x: float
+    learning_penalty: float
+
+
 class Trained(NamedTuple):
     """What planning leaves."""
 
-    params: Any  # of the Q-network, leading axis (seeds,)
-    history: list[dict[str, Any]]  # one row per chunk and seed
+    params: Any  # of the Q-networks, leading axis (members,)
+    history: list[dict[str, Any]]  # one row per chunk and member
     seconds: float  # of all seeds together, without compilation
     compile_seconds: float
 
@@ -180,35 +189,57 @@ def make_pmdp(task: Task, config: Config, models: Mapping | None, params: Any) -
     )
 
 
-def method_name(config: Config) -> str:
+def members_of(config: Config) -> list[Member]:
+    """One for each seed."""
+    first, x, penalty = config.seed, config.x, config.learning_penalty
+    return [Member(first + i, x, penalty) for i in range(config.seeds)]
+
+
+def side_by_side(pmdp: PMDP, members: Sequence[Member]) -> tuple[PMDP, PMDP]:
+    """The P-MDPs of all members, and the `in_axes` of a vmap over them."""
+    x, penalty = (jnp.asarray(v, jnp.float32) for v in zip(*(m[1:] for m in members), strict=True))
+    axes = pmdp.replace(params=None, threats=None, x=0, penalty=0, toll=None)
+    return pmdp.replace(x=x, penalty=penalty), axes
+
+
+def keys_of(members: Sequence[Member], stream: int) -> jax.Array:
+    """(members,) keys of one use; members of one seed share theirs."""
+    return jnp.stack([key_of(member.seed, stream) for member in members])
+
+
+def method_name(config: Config, member: Member | None = None) -> str:
     """RP with its threshold, or DQN with its penalty."""
-    if np.isinf(config.x):
-        return f"DQN (penalty {config.learning_penalty:g})"
-    name = f"RP (x={config.x:g})" if config.baseline == "paper" else f"RP, plans (x={config.x:g})"
-    return name if config.learning_penalty == 0 else f"{name[:-1]}, {config.learning_penalty:g})"
+    x, penalty = member[1:] if member else (config.x, config.learning_penalty)
+    if np.isinf(x):
+        return f"DQN (penalty {penalty:g})"
+    name = f"RP (x={x:g})" if config.baseline == "paper" else f"RP, plans (x={x:g})"
+    return name if penalty == 0 else f"{name[:-1]}, {penalty:g})"
 
 
-def plan(task: Task, config: Config, models: Mapping | None, folder: Path) -> Trained:
-    """Trains all seeds as one program; writes metrics.jsonl as it goes."""
+def plan(
+    task: Task, config: Config, pmdp: PMDP, members: Sequence[Member], folder: Path
+) -> Trained:
+    """Trains all members as one program; writes metrics.jsonl as it goes."""
     planning = config.planning
     warm = -(-planning.replay_start // planning.num_envs)  # iterations before learning
     length = -(-max(1, planning.iterations - warm) // CHUNKS)
     chunks = -(-max(1, planning.iterations - warm) // length)
     steps = (warm + chunks * length) * planning.num_envs
-    pmdp = make_pmdp(task, config, models, task.train)
-    keys = jnp.stack([key_of(config.seed + i, PLANNING) for i in range(config.seeds)])
+    keys = keys_of(members, PLANNING)
+    methods = list(dict.fromkeys(method_name(config, member) for member in members))
     console.say(
-        f"planning: {config.seeds} seed(s) x {steps:,} steps, "
-        f"{planning.samples_per_step:g} samples replayed per step, {method_name(config)}"
+        f"planning: {len(members)} x {steps:,} steps, {planning.samples_per_step:g} samples "
+        f"replayed per step, {'; '.join(methods)}"
     )
+    pmdp, axes = side_by_side(pmdp, members)
     history: list[dict[str, Any]] = []
     with console.progress("planning") as bar:
         bar("", 0, chunks, "compiling")
         began = time.perf_counter()
-        init = jax.jit(jax.vmap(loop.init, (0, None, None)), static_argnums=2)
+        init = jax.jit(jax.vmap(loop.init, (0, axes, None)), static_argnums=2)
         start = init.lower(keys, pmdp, planning).compile()
         chunk = jax.jit(
-            jax.vmap(loop.chunk, (0, None, None, None)), static_argnums=(2, 3), donate_argnums=0
+            jax.vmap(loop.chunk, (0, axes, None, None)), static_argnums=(2, 3), donate_argnums=0
         )
         shapes, _ = jax.eval_shape(init, keys, pmdp, planning)
         step = chunk.lower(shapes, pmdp, planning, length).compile()
@@ -217,30 +248,33 @@ def plan(task: Task, config: Config, models: Mapping | None, folder: Path) -> Tr
         for i in range(chunks):
             state, new = step(state, pmdp)
             metrics = jax.tree.map(jnp.add, metrics, new) if i == 0 else new
-            rows = _chunk_rows(metrics, config, length * planning.updates, history)
+            rows = _chunk_rows(metrics, config, members, length * planning.updates, history)
             history += rows
             seconds = time.perf_counter() - compiled
             for row in rows:
                 row["seconds"] = seconds
             _append_lines(folder / "metrics.jsonl", rows)
             bar("", i + 1, chunks, _note(rows))
-    about = {"method": method_name(config), "seeds": config.seeds, "seed": config.seed}
+    about = {"methods": methods, "members": [member._asdict() for member in members]}
     storage.save(folder / "agent", "Q-network", state.learner.params, about)
     return Trained(state.learner.params, history, seconds, compiled - began)
 
 
-def _chunk_rows(metrics, config: Config, updates: int, history: Sequence) -> list[dict]:
-    """One row per seed of what happened in a chunk."""
+def _chunk_rows(
+    metrics, config: Config, members: Sequence[Member], updates: int, history: Sequence
+) -> list[dict]:
+    """One row per member of what happened in a chunk."""
     sums = {name: np.asarray(value) for name, value in metrics._asdict().items()}
+    before = [row["steps"] for row in history[-len(members) :]] or [0] * len(members)
     rows = []
-    for i in range(config.seeds):
+    for i, member in enumerate(members):
         of = {name: float(value[i]) for name, value in sums.items()}
-        before = [row["steps"] for row in history if row["seed"] == config.seed + i]
         ended = max(of["episodes"], 1.0)
         rows.append(
             {
-                "seed": config.seed + i,
-                "steps": int(of["steps"]) + (before[-1] if before else 0),
+                "seed": member.seed,
+                "method": method_name(config, member),
+                "steps": int(of["steps"]) + before[i],
                 "episodes": int(of["episodes"]),
                 "return_mean": (of["score"] - config.penalty * of["crashes"]) / ended
                 if of["episodes"]
@@ -269,10 +303,10 @@ def _append_lines(path: Path, rows: Sequence[Mapping]) -> None:
 
 
 def evaluate_all(
-    task: Task, config: Config, models: Mapping | None, trained: Trained
+    task: Task, config: Config, pmdp: PMDP, members: Sequence[Member], trained: Trained
 ) -> list[dict[str, Any]]:
-    """One row per variant and seed."""
-    pmdp = make_pmdp(task, config, models, task.train)
+    """One row per variant and member."""
+    pmdp, axes = side_by_side(pmdp, members)
     network = loop.make_network(config.planning, pmdp)
     batch = min(1000, config.episodes)
 
@@ -280,16 +314,17 @@ def evaluate_all(
         values = evaluate.greedy(network, params)
         return evaluate.run_episodes(key, pmdp, values, config.episodes, batch=batch)
 
-    everyone = jax.jit(jax.vmap(one, (0, 0, None)))
-    keys = jnp.stack([key_of(config.seed + i, EVALUATION) for i in range(config.seeds)])
+    everyone = jax.jit(jax.vmap(one, (0, 0, axes)))
+    keys = keys_of(members, EVALUATION)
     rows = []
     with console.progress("evaluation") as bar:
         for done, (variant, params) in enumerate(task.tests.items()):
             bar("", done, len(task.tests), f"{variant}: {config.episodes:,} episodes a seed")
             this = pmdp.replace(params=params)
             episodes = jax.tree.map(np.asarray, everyone(keys, trained.params, this))
-            seconds = action_seconds(this, network, trained.params)
-            for i in range(config.seeds):
+            first = jax.tree.map(lambda a: a[0], trained.params)
+            seconds = action_seconds(this.replace(x=this.x[0]), network, first)
+            for i, member in enumerate(members):
                 found = evaluate.summarise(
                     jax.tree.map(lambda a, i=i: a[i], episodes), config.penalty
                 )
@@ -297,8 +332,9 @@ def evaluate_all(
                     {
                         "env": task.name,
                         "variant": variant,
-                        "method": method_name(config),
-                        "seed": config.seed + i,
+                        "method": method_name(config, member),
+                        "x": member.x,
+                        "seed": member.seed,
                         **found,
                         "seconds_per_100_actions": seconds,
                         "train_seconds": trained.seconds,
@@ -310,7 +346,6 @@ def evaluate_all(
 
 def action_seconds(pmdp: PMDP, network: Any, params: Any) -> float:
     """Wall time of 100 decisions one after another, observation and threat included."""
-    weights = jax.tree.map(lambda a: a[0], params)
     state = jax.vmap(pmdp.env.reset, (0, None))(jax.random.split(jax.random.key(0), 1), pmdp.params)
 
     @jax.jit
@@ -319,10 +354,10 @@ def action_seconds(pmdp: PMDP, network: Any, params: Any) -> float:
         values = evaluate.greedy(network, weights)(percept)
         return jax.vmap(shield.masked_argmax)(values, percept.admissible)
 
-    act(state, weights, pmdp).block_until_ready()
+    act(state, params, pmdp).block_until_ready()
     began = time.perf_counter()
     for _ in range(100):
-        act(state, weights, pmdp).block_until_ready()
+        act(state, params, pmdp).block_until_ready()
     return time.perf_counter() - began
 
 
@@ -357,8 +392,9 @@ def run(task: Task, config: Config, preset: str, folder: Path) -> None:
     storage.write_json(folder / "config.json", settings)
     models, curves, parts = learn_threats(task, config, folder)
     reconnaissance = time.perf_counter() - began
-    trained = plan(task, config, models, folder)
-    rows = evaluate_all(task, config, models, trained)
+    pmdp, members = make_pmdp(task, config, models, task.train), members_of(config)
+    trained = plan(task, config, pmdp, members, folder)
+    rows = evaluate_all(task, config, pmdp, members, trained)
     tables.write(folder, rows)
     training = {
         "steps": sum(row["steps"] for row in trained.history[-config.seeds :]),
@@ -383,6 +419,5 @@ def run(task: Task, config: Config, preset: str, folder: Path) -> None:
         figures = folder / "figures"
         figures.mkdir()
         with console.progress("figures") as bar:
-            pmdp = make_pmdp(task, config, models, task.train)
             task.draw(Finished(task, config, pmdp, trained, rows, curves, figures, bar))
     console.say(f"results: {folder}")

@@ -12,13 +12,13 @@ import numpy as np
 import tyro
 from jax import Array
 
-from experiments import circuit, cli, jam, pipeline, tables
+from experiments import cli, pipeline, tables
+from experiments.runs import EXPERIMENTS
 from rp_jax import storage
 from rp_jax.threat import artefact, report
 from rp_jax.threat.model import ThreatModel
 from rp_jax.validate import one_of
 
-EXPERIMENTS: dict[str, Any] = {"circuit": circuit, "jam": jam}
 RECORDED = {"wall": "wall", "obstacle": "car"}  # kinds of hazard as the files call them
 
 

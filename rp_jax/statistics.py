@@ -29,6 +29,52 @@ def upper_bound(k: int, n: int, confidence: float = 0.95) -> float:
     return 1.0 if k == n else float(stats.beta.ppf(confidence, k + 1, n - k))
 
 
+def plan_test(c: float, confidence: float, expected: float, power: float) -> tuple[int, int]:
+    """The smallest number of trials that can show a rate to be at most c, and the events allowed.
+
+    Args:
+        c: the rate not to be exceeded.
+        confidence: of the one-sided exact bound that must not exceed c.
+        expected: a rate below c that shall pass.
+        power: with at least this probability.
+
+    Returns:
+        (n, k): k or fewer events in n trials show it.
+
+    Raises:
+        ValueError: a value is out of range.
+    """
+    _check_confidence(confidence)
+    number("c", c, above=0)
+    number("expected", expected, least=0)
+    number("power", power, above=0)
+    if not expected < c < 1 or power >= 1:
+        raise ValueError(
+            f"expected is {expected!r}, c is {c!r} and power is {power!r}; they must keep "
+            "0 <= expected < c < 1 and 0 < power < 1"
+        )
+    k = 0
+    while True:
+        n = _trials(k, c, confidence)
+        if stats.binom.cdf(k, n, expected) >= power:
+            return n, k
+        k += 1
+
+
+def _trials(k: int, c: float, confidence: float) -> int:
+    """The fewest trials among which k events exclude a rate above c."""
+    low, high = k, k + 2
+    while stats.binom.cdf(k, high, c) > 1 - confidence:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        if stats.binom.cdf(k, middle, c) > 1 - confidence:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
 def mean_interval(values: np.ndarray, confidence: float = 0.95) -> tuple[float, float]:
     """(mean, half-width) of Student's interval; the half-width is nan for one value."""
     _check_confidence(confidence)

@@ -20,7 +20,7 @@ ORDER = [
     {"recon"},
     {"threat"},
     {"planning", "tabular"},
-    {"evaluate", "baselines"},
+    {"evaluate", "rare", "baselines"},
     {"plot", "adapters"},
 ]
 PLACE = {part: i for i, parts in enumerate(ORDER) for part in parts}

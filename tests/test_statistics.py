@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from rp_jax.statistics import clopper_pearson, mean_interval, upper_bound
+from rp_jax.statistics import clopper_pearson, mean_interval, plan_test, upper_bound
 
 rates = st.integers(1, 300).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
 
@@ -107,3 +107,29 @@ def test_the_mean_of_no_values_and_bad_confidences_are_refused():
         mean_interval([])
     with pytest.raises(ValueError, match=r"^confidence is 1\.5"):
         mean_interval([1.0, 2.0], 1.5)
+
+
+@pytest.mark.parametrize(
+    ("c", "confidence", "expected"), [(1e-3, 0.99, 5e-4), (0.05, 0.95, 0.0), (0.2, 0.9, 0.1)]
+)
+def test_a_planned_test_is_the_smallest_that_can_show_the_rate(c, confidence, expected):
+    n, k = plan_test(c, confidence, expected, 0.9)
+    assert upper_bound(k, n, confidence) <= c
+    assert upper_bound(k, n - 1, confidence) > c
+    assert stats.binom.cdf(k, n, expected) >= 0.9
+    if k > 0:  # fewer events allowed would fail an agent that shall pass
+        fewer = next(m for m in range(k, n) if upper_bound(k - 1, m, confidence) <= c)
+        assert stats.binom.cdf(k - 1, fewer, expected) < 0.9
+
+
+def test_no_event_in_2995_shows_less_than_a_thousandth():
+    assert plan_test(1e-3, 0.95, 0.0, 0.9) == (2995, 0)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [(0.0, 0.9, 0.0, 0.9), (0.1, 0.9, 0.1, 0.9), (0.1, 0.9, -0.1, 0.9), (1.0, 0.9, 0, 0.9)],
+)
+def test_a_test_that_cannot_be_planned_is_refused(values):
+    with pytest.raises(ValueError, match=r"^(c|expected) is"):
+        plan_test(*values)

@@ -42,8 +42,13 @@ class Env(Protocol):
     A `State` has the fields `agent` and `time`. `Params` are pytrees: sweep them by `vmap`.
     """
 
-    LIDAR_BINS: int  # how many of an observation's first values are a LIDAR's distances
-    SCALE: tuple[float, ...]  # brings the others to the order of 1, for learners
+    @property
+    def LIDAR_BINS(self) -> int:  # noqa: N802
+        """How many of an observation's first values are a LIDAR's distances."""
+
+    @property
+    def SCALE(self) -> tuple[float, ...]:  # noqa: N802
+        """Brings the others to the order of 1, for learners."""
 
     def reset(self, key: Array, params: Any) -> Any:
         """Draws a start state. Any other state of the same type can be stepped as well."""

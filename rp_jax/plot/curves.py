@@ -65,6 +65,45 @@ def learning_curves(history: Sequence[Mapping[str, Any]], title: str, path: Path
     plt.close(figure)
 
 
+def frontier(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Return and crash rate over the threshold, with 95 % intervals, a column per variant.
+
+    Args:
+        rows: with variant, planner, x, return_mean, return_ci95, crash_rate, crash_ci95.
+        path: of the PNG.
+    """
+    variants = list(dict.fromkeys(row["variant"] for row in rows))
+    planners = list(dict.fromkeys(row["planner"] for row in rows))
+    figure, axes = plt.subplots(
+        2,
+        len(variants),
+        figsize=(3.8 * len(variants), 6),
+        sharex=True,
+        layout="constrained",
+        squeeze=False,
+    )
+    for j, variant in enumerate(variants):
+        for colour, shift, planner in zip((BLUE, RED), (0.97, 1.03), planners, strict=False):
+            of = [r for r in rows if r["variant"] == variant and r["planner"] == planner]
+            x = [shift * r["x"] for r in of]
+            style = {"color": colour, "marker": ".", "capsize": 2, "label": planner}
+            returns, widths = ([r[k] for r in of] for k in ("return_mean", "return_ci95"))
+            axes[0, j].errorbar(x, returns, widths, **style)
+            rates = np.asarray([100 * r["crash_rate"] for r in of])
+            low, high = 100 * np.asarray([r["crash_ci95"] for r in of]).T
+            axes[1, j].errorbar(x, rates, np.stack([rates - low, high - rates]), **style)
+        axes[0, j].set_title(variant)
+        axes[1, j].set_xlabel("threshold x")
+        for axis in axes[:, j]:
+            axis.set_xscale("log")
+            axis.grid(alpha=0.3)
+    axes[0, 0].set_ylabel("return (crash penalty included)")
+    axes[1, 0].set_ylabel("episodes with a crash, %")
+    axes[0, 0].legend()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
 def fit_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path) -> None:
     """Training and validation loss of the threat models, by kind of hazard."""
     figure, axes = plt.subplots(

@@ -6,56 +6,18 @@ import sys
 import jax
 import numpy as np
 import pytest
-from quick import unoptimised
+from tiny import MODULES, go, programs_of_a_moment  # noqa: F401
 
-from experiments import circuit, cli, jam, pipeline, tables
+from experiments import circuit, pipeline, tables
 from rp_jax import storage
 from rp_jax.planning import loop
 from rp_jax.threat import artefact
 
-MODULES = {"circuit": circuit, "jam": jam}
 PROMISED = [
     *("env", "variant", "method", "seed", "episodes", "return_mean", "return_ci95"),
     *("uncrashed_return_mean", "crashes", "crash_rate", "crash_upper95", "goal_rate"),
     *("interventions", "insecure", "seconds_per_100_actions", "train_seconds"),
 ]
-TINY_FIT = "--{0}.fit.steps 40 --{0}.fit.batch 64 --{0}.fit.hidden 16"
-TINY_THREAT = "--{0}.states 200 --{0}.paths 4 --{0}.test-states 200 --{0}.test-paths 8 " + TINY_FIT
-TINY = (
-    "--planning.steps 480 --planning.num-envs 8 --planning.batch 32 --planning.replay 512 "
-    "--planning.replay-start 64 --planning.n-step 2 --episodes 16 --seeds 2 --x 0.9"
-)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def programs_of_a_moment():
-    """They need no optimising; flashbax needs rank promotion."""
-    with unoptimised(), jax.numpy_rank_promotion("allow"):
-        yield
-
-
-def go(name, out, *options):
-    module = MODULES[name]
-    kinds = ["wall", "obstacle"] if name == "jam" else ["wall"]
-    argv = " ".join([TINY, *(TINY_THREAT.format(kind) for kind in kinds), *options]).split()
-    argv += ["--out", str(out)]
-    main = (f"experiments.{name}", module.__doc__, module.PRESETS, module.make_task, argv)
-    assert cli.main(*main) == out
-    return out
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """A whole run of Circuit, two seeds, without figures."""
-    out = tmp_path_factory.mktemp("results") / "circuit"
-    return go("circuit", out, "--no-figures --track circle --test-tracks circle")
-
-
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory):
-    """A whole run of Jam, with figures."""
-    out = tmp_path_factory.mktemp("results") / "jam"
-    return go("jam", out, "--obstacles 3 --test-obstacles 3")
 
 
 def read(path):

@@ -1,0 +1,241 @@
+"""How rarely does an agent crash, and from where does it crash most? (`rp_jax.rare`)
+
+Multilevel splitting against plain episodes of as many steps; then a search for the worst starts.
+
+python -m experiments.rare --run results/RUN --variant N=8 --out results/rare
+"""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from experiments import cli, console, pipeline, runs
+from rp_jax import evaluate, rare, statistics, storage
+from rp_jax.envs.base import select
+from rp_jax.planning import loop
+from rp_jax.planning.pmdp import PMDP
+from rp_jax.validate import number
+
+
+@dataclass(frozen=True)
+class Config:
+    """What is measured."""
+
+    run: Path  # folder of a finished run
+    out: Path  # new folder for the results
+    variant: str = ""  # the test, such as N=8; default: the first
+    agent: int = 0  # which of the run's seeds, counted from 0
+    particles: int = 1000  # paths a stage
+    repeats: int = 20  # independent estimates, for the interval
+    generations: int = 10  # of the search for the worst starts; 0: no search
+    population: int = 200  # starts a generation
+    tries: int = 50  # episodes from each start
+    kept: int = 20  # worst starts that are kept
+    checks: int = 2000  # fresh episodes from each of those
+    seed: int = 0
+
+    def validate(self) -> None:
+        """Raises ValueError, naming the field, if a value is out of range."""
+        number("agent", self.agent, least=0, integer=True)
+        number("particles", self.particles, least=10, integer=True)
+        number("repeats", self.repeats, least=2, integer=True)
+        number("generations", self.generations, least=0, integer=True)
+        number("population", self.population, least=10, integer=True)
+        number("tries", self.tries, least=1, integer=True)
+        number("kept", self.kept, least=1, most=self.population, integer=True)
+        number("checks", self.checks, least=1, integer=True)
+        number("seed", self.seed, least=0, most=2**31 - 1, integer=True)
+
+
+class Subject(NamedTuple):
+    """The agent under test."""
+
+    pmdp: PMDP
+    values: rare.Values
+    stage: Any  # `rare.advance`, compiled
+
+
+def estimates(key: jax.Array, subject: Subject, config: Config) -> tuple[dict[str, Any], Any]:
+    """Crash probability by splitting and by plain episodes; and starts that led to crashes."""
+    pilot, key, plain_key = jax.random.split(key, 3)
+    pmdp, values, stage = subject
+    began = time.perf_counter()
+    levels = rare.choose_levels(pilot, pmdp, config.particles, stage)
+    found = []
+    with console.progress("splitting") as bar:
+        for i in range(config.repeats):
+            bar("", i, config.repeats, f"{len(levels)} levels")
+            this = jax.random.fold_in(key, i)
+            found.append(rare.splitting(this, pmdp, values, levels, config.particles, stage=stage))
+        bar("", config.repeats, config.repeats)
+    steps = sum(run.steps for run in found)
+    mean, width = statistics.mean_interval(np.asarray([run.estimate for run in found]))
+    took = time.perf_counter() - began
+    n = k = played = 0
+    with console.progress("plain episodes") as bar:
+        while played < steps:
+            this = jax.random.fold_in(plain_key, n)
+            paths = stage(this, rare.begin(this, pmdp, config.particles), pmdp, np.float32(np.inf))
+            n, k = n + config.particles, k + int(paths.crashed.sum())
+            played += int(paths.length.sum())
+            bar("", min(played, steps), steps, f"{k} crashes of {n:,}")
+    low, high = statistics.clopper_pearson(k, n)
+    row = {
+        "levels": levels,
+        "rates": np.mean([r.rates for r in found if len(r.rates) == len(levels) + 1], axis=0)
+        if any(len(r.rates) == len(levels) + 1 for r in found)
+        else [],
+        "estimate": mean,
+        "ci95": [max(0.0, mean - width), mean + width],
+        "repeats": config.repeats,
+        "steps": steps,
+        "seconds": took,
+        "plain": {"episodes": n, "crashes": k, "rate": k / n, "ci95": [low, high], "steps": played},
+    }
+    starts = [run.starts for run in found if run.starts is not None]
+    together = jax.tree.map(lambda *a: np.concatenate(a), *starts) if starts else None
+    return row, together
+
+
+def crashes_from(key: jax.Array, subject: Subject, starts: Any, tries: int) -> np.ndarray:
+    """(n,) crashes in `tries` episodes from each of the starts (n, ...)."""
+    count = starts.time.shape[0]
+    block = max(1, min(tries, 20_000 // count))
+    total = np.zeros(count, int)
+    many = jax.tree.map(lambda a: jnp.repeat(jnp.asarray(a), block, axis=0), starts)
+    for i, done in enumerate(range(0, tries, block)):
+        paths = rare.from_starts(many, subject.pmdp)
+        this = jax.random.fold_in(key, i)
+        crashed = subject.stage(this, paths, subject.pmdp, np.float32(np.inf)).crashed
+        total += np.asarray(crashed).reshape(count, block)[:, : tries - done].sum(axis=1)
+    return total
+
+
+def offspring(key: jax.Array, parent: Any, fresh: Any, share: float = 0.2) -> Any:
+    """A start like its parent, in which obstacles are drawn afresh with probability `share`.
+
+    Obstacles are independent of one another at the start, so it is one that the environment may
+    draw. Without obstacles, the whole start is drawn afresh with that probability.
+    """
+    if not hasattr(parent, "obstacles"):
+        return select(jax.random.bernoulli(key, share), fresh, parent)
+    renewed = jax.random.bernoulli(key, share, parent.present.shape)
+    rows = jax.vmap(select)(
+        renewed, (fresh.obstacles, fresh.present), (parent.obstacles, parent.present)
+    )
+    return parent.replace(obstacles=rows[0], present=rows[1])
+
+
+def worst_starts(key: jax.Array, subject: Subject, first: Any, config: Config) -> Any:
+    """The starts (kept, ...) of most crashes: the worst tenth of each generation has offspring.
+
+    Args:
+        key: of the search.
+        subject: the agent.
+        first: starts that have led to crashes, (n, ...); or None.
+        config: sizes.
+    """
+    pmdp, size = subject.pmdp, config.population
+    elite = max(config.kept, size // 10)
+    draw = jax.jit(
+        lambda key: jax.vmap(pmdp.env.reset, (0, None))(jax.random.split(key, size), pmdp.params)
+    )
+    breed = jax.jit(jax.vmap(offspring))
+    first_key, key = jax.random.split(key)
+    starts = draw(first_key)
+    if first is not None:
+        n = min(size, first.time.shape[0])
+        starts = jax.tree.map(lambda a, b: jnp.concatenate([a[:n], b[n:]]), first, starts)
+    with console.progress("worst starts") as bar:
+        for i in range(config.generations):
+            play, parent_key, fresh_key, mix_key = jax.random.split(jax.random.fold_in(key, i), 4)
+            crashes = crashes_from(play, subject, starts, config.tries)
+            order = np.argsort(-crashes, kind="stable")[:elite]
+            note = f"the worst {elite} crash in {100 * crashes[order].mean() / config.tries:.1f} %"
+            bar("", i + 1, config.generations, note)
+            best = jax.tree.map(lambda a, order=order: a[order], starts)
+            if i == config.generations - 1:
+                return jax.tree.map(lambda a: a[: config.kept], best)
+            chosen = jax.random.randint(parent_key, (size - elite,), 0, elite)
+            parents = jax.tree.map(lambda a, chosen=chosen: a[chosen], best)
+            fresh = jax.tree.map(lambda a: a[: size - elite], draw(fresh_key))
+            children = breed(jax.random.split(mix_key, size - elite), parents, fresh)
+            starts = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), best, children)
+    return jax.tree.map(lambda a: a[: config.kept], starts)
+
+
+def run(config: Config, loaded: runs.Run, folder: Path) -> dict[str, Any]:
+    """Writes rare.json and, after a search, worst_starts.npz."""
+    number("agent", config.agent, most=loaded.config.seeds - 1)
+    variant = config.variant or next(iter(loaded.task.tests))
+    pmdp = loaded.pmdp(variant)
+    network = loop.make_network(loaded.config.planning, pmdp)
+    values = evaluate.greedy(network, jax.tree.map(lambda a: a[config.agent], loaded.params))
+    subject = Subject(pmdp, values, rare.compiled(values))
+    key, search, check = jax.random.split(pipeline.key_of(config.seed, pipeline.RARE), 3)
+    row, starts = estimates(key, subject, config)
+    row = {"env": loaded.task.name, "variant": variant, "sha256": loaded.sha256, **row}
+    if config.generations > 0:
+        worst = worst_starts(search, subject, starts, config)
+        crashes = crashes_from(check, subject, worst, config.checks)
+        row["worst_starts"] = [
+            {
+                "crashes": int(k),
+                "episodes": config.checks,
+                "ci95": list(statistics.clopper_pearson(int(k), config.checks)),
+            }
+            for k in crashes
+        ]
+        about = {"env": loaded.task.name, "variant": variant, "sha256": loaded.sha256}
+        storage.save(folder / "worst_starts", "start states", worst, about)
+    storage.write_json(folder / "rare.json", {**row, "seed": config.seed})
+    show(row)
+    return row
+
+
+def show(row: dict[str, Any]) -> None:
+    """The estimates on the terminal."""
+    plain = row["plain"]
+    lines = [
+        {
+            "by": f"splitting, {len(row['levels'])} levels, {row['repeats']} repeats",
+            "crash rate": f"{row['estimate']:.3g}",
+            "95 %": "[{:.3g}, {:.3g}]".format(*row["ci95"]),
+            "steps": f"{row['steps']:,}",
+        },
+        {
+            "by": f"plain, {plain['crashes']} of {plain['episodes']:,} episodes",
+            "crash rate": f"{plain['rate']:.3g}",
+            "95 %": "[{:.3g}, {:.3g}]".format(*plain["ci95"]),
+            "steps": f"{plain['steps']:,}",
+        },
+    ]
+    console.table(f"crash rate of {row['env']} {row['variant']}", lines, list(lines[0]))
+    if row.get("worst_starts"):
+        k = sum(r["crashes"] for r in row["worst_starts"])
+        n = sum(r["episodes"] for r in row["worst_starts"])
+        low, high = statistics.clopper_pearson(k, n)
+        console.say(
+            f"from the {len(row['worst_starts'])} worst starts found: {k} crashes of {n:,}, "
+            f"{100 * k / n:.2f} [{100 * low:.2f}, {100 * high:.2f}] %"
+        )
+
+
+def main() -> None:
+    """Exits with 2 on bad input."""
+    config = tyro.cli(Config, description=__doc__)
+    with cli.bad_input():
+        config.validate()
+        loaded = runs.load(config.run)
+        folder = storage.new_folder(config.out)
+        run(config, loaded, folder)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+"""Finished runs, read back from their folders: settings, threat models and agents."""
+
+import dataclasses
+import hashlib
+import json
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from experiments import circuit, jam, pipeline
+from rp_jax import storage
+from rp_jax.planning import loop
+from rp_jax.planning.pmdp import PMDP
+from rp_jax.threat import artefact
+from rp_jax.validate import one_of
+
+EXPERIMENTS: dict[str, Any] = {"circuit": circuit, "jam": jam}
+
+
+class Run(NamedTuple):
+    """What a finished run leaves to be used again."""
+
+    task: pipeline.Task
+    config: Any  # the task's own Config
+    models: dict | None  # threat models by kind of hazard; None: no shield
+    params: Any  # of the Q-networks, leading axis (seeds,)
+    sha256: str  # of the settings, the agents and the threat models
+
+    def pmdp(self, variant: str) -> PMDP:
+        """The P-MDP of one of the tests.
+
+        Raises:
+            ValueError: there is no such test.
+        """
+        params = self.task.tests[one_of("variant", variant, self.task.tests)]
+        return pipeline.make_pmdp(self.task, self.config, self.models, params)
+
+
+def load(folder: Path) -> Run:
+    """Reads a run.
+
+    Raises:
+        ValueError: something is missing, damaged, or does not fit together.
+    """
+    folder = Path(folder)
+    path = folder / "config.json"
+    try:
+        settings = json.loads(path.read_text())
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise storage.StorageError(f"{path}: cannot be read ({error})") from error
+    if not isinstance(settings, dict):
+        raise storage.StorageError(f"{path}: it must be a table")
+    module = EXPERIMENTS[one_of(f"{path}: task", str(settings.get("task")), EXPERIMENTS)]
+    config = restored(module.Config, settings, str(path))
+    config.validate()
+    task: pipeline.Task = module.make_task(config)
+    subs = task.env.sub_rmdps(task.train)
+    threats = config.threat or folder / "threat"
+    models: dict | None = {}
+    used = [path, folder / "agent" / "arrays.npz"]
+    if np.isinf(config.x):
+        models = None
+    elif subs:
+        models = artefact.load(threats, task.name, subs)
+        used.append(threats / "arrays.npz")
+    pmdp = pipeline.make_pmdp(task, config, models, task.train)
+    shapes = jax.eval_shape(
+        lambda key: loop.init(key, pmdp, config.planning)[0].learner.params, jax.random.key(0)
+    )
+    like = jax.tree.map(lambda s: np.zeros((config.seeds, *s.shape), s.dtype), shapes)
+    params = storage.load(folder / "agent", "Q-network", like)
+    digest = hashlib.sha256(b"".join(file.read_bytes() for file in used)).hexdigest()
+    return Run(task, config, models, params, digest)
+
+
+def restored(kind: type, plain: Any, where: str) -> Any:
+    """A dataclass from what `storage.write_json` made of it. Fields not there keep their default.
+
+    Raises:
+        storage.StorageError: a value is not of its field's type.
+    """
+    if not isinstance(plain, Mapping):
+        raise storage.StorageError(f"{where}: it is {plain!r}; it must be a table")
+    types_of = typing.get_type_hints(kind)
+    names = [f.name for f in dataclasses.fields(kind) if f.name in plain]
+    return kind(**{n: _value(types_of[n], plain[n], f"{where}: {n}") for n in names})
+
+
+def _value(kind: Any, plain: Any, where: str) -> Any:
+    if dataclasses.is_dataclass(kind):
+        return restored(typing.cast(type, kind), plain, where)
+    options = typing.get_args(kind)
+    if isinstance(kind, types.UnionType):
+        return None if plain is None else _value(options[0], plain, where)
+    if typing.get_origin(kind) is tuple and isinstance(plain, list):
+        return tuple(_value(options[0], item, where) for item in plain)
+    if kind is float and plain in ("inf", "-inf"):
+        return float(plain)
+    if kind is float and isinstance(plain, int | float) and not isinstance(plain, bool):
+        return float(plain)
+    if kind is Path and isinstance(plain, str):
+        return Path(plain)
+    if kind in (int, bool, str) and type(plain) is kind:
+        return plain
+    name = getattr(kind, "__name__", kind)
+    raise storage.StorageError(f"{where} is {plain!r}; it must be of type {name}")
