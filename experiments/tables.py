@@ -111,6 +111,7 @@ def show_threats(rows: Sequence[Mapping[str, Any]], x: float, truth: str = "fres
             **{name: row[name] for name in ("mae", "rmse", "bias", "spearman")},
             "unsafe called safe": f"{100 * row['unsafe_called_safe']:.2f} %",
             "safe called unsafe": f"{100 * row['safe_called_unsafe']:.2f} %",
+            "states missed": f"{row['states_missed']} of {row['unsafe_states']}",
         }
         for row in rows
     ]

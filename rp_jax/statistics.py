@@ -75,6 +75,14 @@ def _trials(k: int, c: float, confidence: float) -> int:
     return high
 
 
+def events_allowed(n: int, rate: float, confidence: float = 0.95) -> int:
+    """The most events of n whose one-sided exact bound is at most `rate`; -1 if not even none."""
+    k = int(stats.binom.ppf(1 - confidence, n, rate)) + 1 if n else -1
+    while k >= 0 and (k > n or upper_bound(k, n, confidence) > rate):
+        k -= 1
+    return k
+
+
 def mean_interval(values: np.ndarray, confidence: float = 0.95) -> tuple[float, float]:
     """(mean, half-width) of Student's interval; the half-width is nan for one value."""
     _check_confidence(confidence)

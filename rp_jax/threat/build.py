@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from rp_jax import statistics
 from rp_jax.hazards import SubRMDP
 from rp_jax.recon import labels, sampling
 from rp_jax.threat import fit, report
@@ -29,7 +30,8 @@ class ThreatConfig:
     states: int = 200_000  # labelled start states
     paths: int = 64  # rollouts per state, where the label is not exact
     sampling: str = "uniform"  # of the start states: uniform or preferential
-    prudence: float = 1.0  # most unsafe pairs to be called safe, of hard ones; 1: as fitted
+    prudence: float = 1.0  # most states near x with an unsafe action called safe; 1: as fitted
+    confidence: float = 0.95  # of that
     test_states: int = 2000  # fresh states that the report is made on
     test_paths: int = 8192  # rollouts per fresh state, where the label is not exact
     fit: FitConfig = field(default_factory=FitConfig)
@@ -40,6 +42,7 @@ class ThreatConfig:
         number(f"{name}.paths", self.paths, least=2, integer=True)
         one_of(f"{name}.sampling", self.sampling, SAMPLINGS)
         number(f"{name}.prudence", self.prudence, above=0, most=1)
+        number(f"{name}.confidence", self.confidence, above=0, most=0.999999)
         number(f"{name}.test_states", self.test_states, least=10, integer=True)
         number(f"{name}.test_paths", self.test_paths, least=2, integer=True)
         self.fit.validate(f"{name}.fit")
@@ -98,17 +101,58 @@ def fitted(
     return model.replace(params=state.params), curve
 
 
-def prudent(model: ThreatModel, data: Dataset, x: float, rate: float) -> ThreatModel:
-    """Shifts the logits up until at most `rate` of the pairs truly above x are called safe.
+class Calibration(NamedTuple):
+    """What is known of a calibrated model; of states drawn as those it was calibrated on."""
 
-    The shift is never downwards. Outside 0 < x < 1 no shift could change a decision.
+    rate: float  # at most this share of the states with an unsafe action have one called safe,
+    confidence: float  # with this confidence (over the draw of the states)
+    states: int  # drawn
+    unsafe_states: int  # with an action above x
+    missed: int  # those of which an unsafe action is still called safe
+
+
+def calibrated(
+    model: ThreatModel, data: Dataset, x: float, rate: float, confidence: float
+) -> tuple[ThreatModel, Calibration]:
+    """Shifts the logits up until few states have an unsafe action (label above x) called safe.
+
+    The least shift for which the exact upper bound of that share is at most `rate`: an order
+    statistic of the shift each state needs, as in split-conformal prediction. The bound holds for
+    independent states that the model has not been fitted to, whatever the model; never downwards.
+    Where there are too few unsafe states for the rate, none is let through, and `rate` is what
+    that shows.
+
+    Args:
+        model: as fitted.
+        data: labelled states, independent of one another and of the fit.
+        x: threshold, inside (0, 1): elsewhere no shift could change a decision.
+        rate: most states with an unsafe action called safe.
+        confidence: of the statement.
     """
     unsafe = np.asarray(data.threat) > x
-    if not unsafe.any() or not 0 < x < 1:
-        return model
-    short = np.log(x / (1 - x)) - np.asarray(model.logits(data.features))[unsafe]
-    shift = max(0.0, float(np.quantile(short, 1 - rate, method="higher")) + 1e-4)
-    return model.replace(shift=model.shift + shift)
+    counted = unsafe.any(axis=1)
+    n = int(counted.sum())
+    if n == 0 or not 0 < x < 1:
+        return model, Calibration(1.0, confidence, len(unsafe), n, 0)
+    short = np.where(unsafe, np.log(x / (1 - x)) - np.asarray(model.logits(data.features)), -np.inf)
+    needed = np.sort(short.max(axis=1)[counted])[::-1]
+    allowed = max(0, statistics.events_allowed(n, rate, confidence))
+    shift = max(0.0, float(needed[allowed]) + 1e-4)
+    missed = int((needed > shift).sum())
+    bound = statistics.upper_bound(allowed, n, confidence)
+    facts = Calibration(bound, confidence, len(unsafe), n, missed)
+    return model.replace(shift=model.shift + shift), facts
+
+
+def near_threshold(key: Array, sub: SubRMDP, model: ThreatModel, x: float, most: int) -> Array:
+    """(n <= most, F) features of states that matter, independent of one another.
+
+    Drawn uniformly and kept with the probability that `sampling.interest` says.
+    """
+    draw_key, keep_key = jax.random.split(key)
+    pool = sampling.uniform(draw_key, sub, 20 * most)
+    odds = jnp.minimum(sampling.interest(model(pool), x), 1.0)
+    return pool[np.flatnonzero(jax.random.bernoulli(keep_key, odds))[:most]]
 
 
 def build(
@@ -146,12 +190,13 @@ def build(
     jax.block_until_ready(data)
     labelled = time.perf_counter()
     model, curve = fitted(keys[5], sub, data, config.fit, on_progress)
+    facts = {}
     if config.prudence < 1:
-        pool = sampling.uniform(keys[8], sub, 20 * config.test_states)
-        order = jnp.argsort(-sampling.interest(model(pool), x))
-        hard = pool[order[: config.test_states]]
-        checked = _labelled(keys[6], hard, sub, accurate, "prudence", on_progress)
-        model = prudent(model, checked, x, config.prudence)
+        hard = near_threshold(keys[8], sub, model, x, config.test_states)
+        checked = _labelled(keys[6], hard, sub, accurate, "calibration", on_progress)
+        rate, confidence = config.prudence, config.confidence
+        model, known = calibrated(model, checked, x, rate, confidence)
+        facts = {"calibration": known._asdict()}
     fitted_at = time.perf_counter()
     fresh_key, test_key = jax.random.split(keys[7])
     fresh = sampling.uniform(fresh_key, sub, config.test_states)
@@ -162,4 +207,4 @@ def build(
         "fit": fitted_at - labelled,
         "report": time.perf_counter() - fitted_at,
     }
-    return Built(model, curve, {**found, "x": x, "shift": float(model.shift)}, seconds)
+    return Built(model, curve, {**found, "x": x, "shift": float(model.shift), **facts}, seconds)

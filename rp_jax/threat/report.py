@@ -8,19 +8,24 @@ import numpy as np
 from jax import Array
 from scipy import stats
 
+from rp_jax import statistics
 from rp_jax.envs.base import Hazards
 from rp_jax.recon import labels
 from rp_jax.threat.model import ThreatModel
 
 
 def compare(predicted: np.ndarray, true: np.ndarray, x: float) -> dict[str, float]:
-    """Errors of predicted against true threats, arrays of one shape, and decisions at x.
+    """Errors of predicted against true threats (n, A) of n states, and decisions at x.
 
     Returns:
         mae, rmse, spearman (nan if either is constant); unsafe_called_safe: of the pairs truly
         above x, the share predicted at most x; safe_called_unsafe: of the pairs truly at most x,
-        the share predicted above; and the number of pairs of either kind.
+        the share predicted above; and the number of pairs of either kind. unsafe_states: those
+        with an unsafe action; states_missed: of these, those with one called safe, and the
+        one-sided exact 95 % bound of their share.
     """
+    missed = (true > x) & (np.asarray(predicted) <= x)
+    states, of = int(missed.any(axis=-1).sum()), int((true > x).any(axis=-1).sum())
     predicted, true = np.ravel(predicted).astype(float), np.ravel(true).astype(float)
     error = predicted - true
     unsafe, called = true > x, predicted > x
@@ -34,6 +39,9 @@ def compare(predicted: np.ndarray, true: np.ndarray, x: float) -> dict[str, floa
         "safe": int((~unsafe).sum()),
         "unsafe_called_safe": float((unsafe & ~called).sum() / max(1, unsafe.sum())),
         "safe_called_unsafe": float((~unsafe & called).sum() / max(1, (~unsafe).sum())),
+        "unsafe_states": of,
+        "states_missed": states,
+        "states_missed_upper95": statistics.upper_bound(states, of) if of else 1.0,
     }
 
 

@@ -22,12 +22,13 @@ TINY = ThreatConfig(
     fit=FitConfig(hidden=(16,), steps=200, batch=64, learning_rate=1e-2),
 )
 REPORT = {
+    *("unsafe_states", "states_missed", "states_missed_upper95"),
     *("mae", "rmse", "bias", "spearman", "unsafe", "safe"),
     *("unsafe_called_safe", "safe_called_unsafe", "x", "shift"),
 }
 STAGES = {
     "uniform": ["labels", "fit", "report"],
-    "preferential": ["labels", "fit", "labels", "fit", "prudence", "report"],
+    "preferential": ["labels", "fit", "labels", "fit", "calibration", "report"],
 }
 SHORT = {circuit: {"horizon": 3}, jam: {"obstacle_horizon": 3}}  # rollouts, to compile soon
 draw = jax.jit(sampling.uniform, static_argnums=2)
@@ -67,8 +68,11 @@ each_case = pytest.mark.parametrize(("env", "kind", "way"), CASES)
 @each_case
 def test_it_learns_something_and_reports_it(env, kind, way):
     _, found, _ = built(env, kind, way)
-    assert set(found.report) == REPORT
-    assert all(np.isfinite(value) for value in found.report.values())
+    numbers = dict(found.report)
+    if way == "preferential":  # the one that is calibrated
+        assert numbers.pop("calibration")["unsafe_states"] > 0
+    assert set(numbers) == REPORT
+    assert all(np.isfinite(value) for value in numbers.values())
     assert found.report["x"] == 0.01
     assert found.report["unsafe"] + found.report["safe"] == 150 * 15
     assert found.report["spearman"] > 0.2
@@ -152,6 +156,7 @@ def test_a_fit_shorter_than_its_chunks_still_runs():
         ({"prudence": 0.0}, "prudence"),
         ({"prudence": 1.5}, "prudence"),
         ({"prudence": float("nan")}, "prudence"),
+        ({"confidence": 1.0}, "confidence"),
         ({"test_states": 9}, "test_states"),
         ({"test_paths": 0}, "test_paths"),
         ({"fit": FitConfig(batch=0)}, r"fit\.batch"),

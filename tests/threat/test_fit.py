@@ -10,7 +10,7 @@ from quick import compile_soon  # noqa: F401
 from rp_jax.envs import circuit, jam
 from rp_jax.kinematics import angle_of
 from rp_jax.recon import sampling
-from rp_jax.threat import build, fit
+from rp_jax.threat import fit
 from rp_jax.threat.fit import Dataset, FitConfig
 
 CONFIG = FitConfig(hidden=(16,), steps=400, batch=64, learning_rate=1e-2)
@@ -150,41 +150,6 @@ def test_the_mirror_s_labels_are_those_of_the_mirrored_states(env, exact):
     assert (jnp.abs(data.threat[:, 0] - data.threat[:, 4]) > 0.01).any()  # left is not right
     both = fit.mirror(data, sub)
     np.testing.assert_allclose(exact(both.features[50:], sub).threat, both.threat[50:], atol=1e-5)
-
-
-def called_safe(model, data, x):
-    unsafe = np.asarray(data.threat) > x
-    return float((np.asarray(model(data.features))[unsafe] <= x).mean())
-
-
-@pytest.mark.parametrize("x", [0.001, 0.01, 0.3])
-@pytest.mark.parametrize("rate", [0.2, 0.01, 1e-4])
-def test_prudence_reaches_its_rate_and_no_more(rate, x):
-    model = start()[0].replace(shift=jnp.asarray(-8.0))
-    assert called_safe(model, toy(), x) > rate
-    careful = build.prudent(model, toy(), x, rate)
-    assert called_safe(careful, toy(), x) <= rate
-    assert careful.shift > model.shift
-    less = careful.replace(shift=careful.shift - 0.1)
-    assert called_safe(less, toy(), x) > rate  # it does not shift farther than it must
-
-
-def test_prudence_never_shifts_downwards():
-    model = start()[0].replace(shift=jnp.asarray(9.0))
-    assert called_safe(model, toy(), 0.01) == 0
-    assert build.prudent(model, toy(), 0.01, 0.5).shift == 9.0
-
-
-def test_prudence_leaves_a_model_alone_where_nothing_is_unsafe():
-    model = start()[0]
-    harmless = toy()._replace(threat=jnp.zeros((1000, 15)))
-    assert build.prudent(model, harmless, 0.01, 0.1).shift == 0
-    assert build.prudent(model, toy(), 1.0, 0.1).shift == 0
-
-
-def test_prudence_can_be_asked_for_at_a_threshold_of_zero():
-    careful = build.prudent(start()[0], toy(), 0.0, 0.1)
-    assert np.isfinite(careful.shift)
 
 
 @pytest.mark.parametrize(

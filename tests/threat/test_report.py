@@ -26,6 +26,8 @@ def test_errors_and_decisions_by_hand():
     assert (found["unsafe"], found["safe"]) == (4, 2)  # .01 itself is admissible
     assert found["unsafe_called_safe"] == pytest.approx(1 / 4)
     assert found["safe_called_unsafe"] == pytest.approx(1 / 2)
+    assert (found["states_missed"], found["unsafe_states"]) == (1, 2)
+    assert found["states_missed_upper95"] == pytest.approx(0.95**0.5)
     expected = stats.spearmanr([0.1, 0.02, 0.005, 0.0, 0.3, 0.9], true.ravel())[0]
     assert found["spearman"] == pytest.approx(expected)
 
