@@ -48,6 +48,7 @@ def crowded(**settings):
     return jam.start_at(agent, others, params_of("jam", num_obstacles=3, **settings))
 
 
+@functools.cache
 def driven(env, count, steps, **settings):
     """States that random driving, mostly forwards, comes by; ended ones are left out."""
     params = params_of(env, **settings)
@@ -217,7 +218,8 @@ def test_safe_sequences_come_before_all_others():
 
 
 def test_a_row_does_not_depend_on_its_batch():
-    search, states = search_of("jam", 3), driven("jam", 12, 11)
+    settings = {"num_obstacles": 3}
+    search, states = search_of("jam", 2, **settings), driven("jam", 12, 11, **settings)
     scores = jax.jit(lambda states, alive: mpc.policy(search)(percept(states, alive)))
     everyone = np.ones(states.time.shape, bool)
     together = np.asarray(scores(states, everyone))
@@ -288,7 +290,7 @@ def test_the_state_is_seen_by_nobody_else():
 @pytest.mark.parametrize("env", ENVS)
 def test_alone_nothing_is_random(env):
     params = params_of(env)
-    states = driven(env, 20, 11)
+    states = driven(env, 16, 11)
 
     @jax.jit
     @jax.vmap
