@@ -162,6 +162,11 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
     )
 
 
+def alone(state: State) -> State:
+    """The state without hazards that move: there are none."""
+    return state
+
+
 def observe(state: State, params: Params) -> Array:
     """(364,) LIDAR (360), x, y, direction of the track relative to the heading, speed."""
     agent, track = state.agent, params.track

@@ -308,6 +308,12 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
     return transition(state, action, draw(key, state, action, params), params)
 
 
+def alone(state: State) -> State:
+    """The state without obstacles; a single absent one keeps the step's arrays from being empty."""
+    one = jax.tree.map(lambda a: a[:1], state.obstacles)
+    return state.replace(obstacles=one, present=jnp.zeros(1, bool))
+
+
 def _seen_obstacles(state: State) -> Array:
     """(8, 4) the nearest obstacles by distance: x, y, heading in the agent's frame, speed."""
     agent = state.agent

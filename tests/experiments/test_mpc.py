@@ -1,0 +1,57 @@
+"""The command that measures MPC."""
+
+import json
+import sys
+
+import jax.numpy as jnp
+import pytest
+from quick import compile_soon  # noqa: F401
+
+from experiments import mpc
+
+
+def command(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["mpc", *words])
+    mpc.main()
+
+
+def test_the_command_writes_a_table(tmp_path, monkeypatch, capsys):
+    out = tmp_path / "run"
+    words = ["--env", "jam", "--horizon", "1", "--episodes", "3", "--variants", "N=3"]
+    command(monkeypatch, *words, "--out", str(out))
+    assert {path.name for path in out.iterdir()} == {"config.json", "table.csv", "table.json"}
+    (row,) = json.loads((out / "table.json").read_text())
+    assert (row["variant"], row["method"], row["episodes"]) == ("N=3", "MPC (1 steps)", 3)
+    assert row["seconds_per_100_actions_in_batch"] > 0
+    assert row["cpu_seconds_per_100_actions"] > 0
+    assert json.loads((out / "config.json").read_text())["penalty"] == 50
+    assert "CPU seconds one after another" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="2"):
+        command(monkeypatch, *words, "--out", str(out))  # the folder exists
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--env", "maze", "--horizon", "2"), "env is 'maze'; it must be one of 'circuit', 'jam'"),
+        (("--env", "jam", "--horizon", "0"), "horizon is 0; it must be an integer, at least 1"),
+        (("--env", "jam", "--horizon", "2", "--episodes", "0"), "episodes is 0; it must be"),
+        (("--env", "jam", "--horizon", "2", "--variants", "N=4"), "variants is 'N=4'; it must be"),
+        (("--env", "jam", "--horizon", "2", "--penalty", "-1"), "penalty is -1.0; it must be"),
+        (("--env", "jam", "--horizon", "2", "--limit", "nan"), "limit is nan; it must be"),
+    ],
+)
+def test_bad_input_is_named(monkeypatch, capsys, tmp_path, words, message):
+    with pytest.raises(SystemExit, match="2"):
+        command(monkeypatch, *words, "--out", str(tmp_path / "run"))
+    assert message in capsys.readouterr().out
+    assert not (tmp_path / "run").exists()
+
+
+def test_penalties_are_those_of_the_paper():
+    for env, penalty in (("circuit", 200), ("jam", 50)):
+        task, searches, taken = mpc.prepare(mpc.Config(env=env, horizon=2))
+        assert taken == penalty
+        assert len(searches) == len(task.tests) == 3
+        assert all(float(search.penalty) == penalty for search in searches)
+    assert jnp.isinf(searches[0].limit)
