@@ -15,12 +15,12 @@ import numpy as np
 import tyro
 
 import rp_jax
-from experiments import circuit, cli, console, jam, pipeline, tables
+from experiments import cli, console, pipeline, tables
+from experiments.runs import EXPERIMENTS
 from rp_jax import evaluate, storage
 from rp_jax.baselines import mpc
 from rp_jax.validate import number, one_of
 
-EXPERIMENTS: dict[str, Any] = {"circuit": circuit, "jam": jam}
 GROUP = 50  # episodes between two reports of progress
 
 
