@@ -173,13 +173,13 @@ class JaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._key, self.states, seen, last, outcome = _advance_all(
             self.env, self._key, self.states, taken, self.params
         )
-        done = np.array(outcome.done)
+        ended = np.array(outcome.terminated), np.array(outcome.truncated)
         everywhere = np.ones(self.num_envs, bool)
         costs = {"cost": np.array(outcome.danger), "goal": np.array(outcome.goal)}
         info: dict[str, Any] = costs | {f"_{name}": everywhere.copy() for name in costs}
+        done = ended[0] | ended[1]
         if done.any():
             info |= _final(np.asarray(last), costs, done)
-        ended = np.array(outcome.terminated), np.array(outcome.truncated)
         return np.array(seen), np.array(outcome.reward), *ended, info
 
 
