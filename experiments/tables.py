@@ -50,7 +50,7 @@ def write(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
                 "case": row["variant"],
                 "return over seeds": f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}",
                 "crashes": f"{row['crashes']:,} of {row['episodes']:,}",
-                "% [95 %]": _percent(row),
+                "% [95 %]": percent(row),
             }
             for row in summary
         ]
@@ -73,7 +73,8 @@ def _causes(causes: Mapping[str, int]) -> str:
     return ", ".join(f"{kind} {count}" for kind, count in causes.items())
 
 
-def _percent(row: Mapping[str, Any]) -> str:
+def percent(row: Mapping[str, Any]) -> str:
+    """The crash rate and its exact interval, in per cent."""
     low, high = (100 * bound for bound in row["crash_ci95"])
     return f"{100 * row['crash_rate']:.3f} [{low:.3f}, {high:.3f}]"
 
