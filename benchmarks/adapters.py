@@ -5,14 +5,12 @@ import resource
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import numpy as np
 
 from benchmarks.measure import Row, main
 from rp_jax.adapters import registry
-from rp_jax.adapters.gymnasium import JaxVectorEnv
 from rp_jax.envs import base
 
 STEPS, REPEATS = 10, 40
@@ -41,6 +39,8 @@ def raw(name: str, batch: int) -> Callable[[np.ndarray], None]:
 
 def adapted(name: str, batch: int) -> Callable[[np.ndarray], None]:
     """The same through gymnasium."""
+    from rp_jax.adapters.gymnasium import JaxVectorEnv
+
     env = JaxVectorEnv(name, batch)
     env.reset(seed=0)
 
@@ -65,9 +65,9 @@ def run(batch: int = 1024) -> list[Row]:
     """Environment steps per second, and how much of the raw step's rate is left."""
     rows = []
     for name in ("circuit", "jam"):
-        draw: Any = np.random.default_rng(0)
-        count = JaxVectorEnv(name, 1).single_action_space.n  # type: ignore[attr-defined]
-        actions = [draw.integers(count, size=batch) for _ in range(STEPS)]
+        env, params = registry.make(name)
+        draws = jax.random.randint(jax.random.key(0), (STEPS, batch), 0, env.num_actions(params))
+        actions = list(np.asarray(draws))
         rates = alternated([raw(name, batch), adapted(name, batch)], actions)
         shares = [after / before for before, after in zip(*rates, strict=True)]
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -57,8 +57,9 @@ def _checked(action: Any, shape: tuple[int, ...], count: int) -> np.ndarray:
     return given.astype(np.int32)
 
 
-def _key(random: np.random.Generator) -> jax.Array:
-    return jax.random.key(int(random.integers(2**31)))
+def _key(env: Any) -> jax.Array:
+    """From gymnasium's own source of randomness, which a seed has been given to."""
+    return jax.random.key(int(env.np_random.integers(2**31)))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -111,7 +112,7 @@ class Env(gymnasium.Env[np.ndarray, np.int64]):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """A start drawn anew; `seed` makes it and all that follow repeatable."""
         super().reset(seed=seed)
-        self._key, self.state, seen = _start(self.env, _key(self.np_random), self.params)
+        self._key, self.state, seen = _start(self.env, _key(self), self.params)
         return np.array(seen), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -154,9 +155,7 @@ class JaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts drawn anew; `seed` makes them and all that follow repeatable."""
         super().reset(seed=seed)
-        self._key, self.states, seen = _start_all(
-            self.env, _key(self.np_random), self.num_envs, self.params
-        )
+        self._key, self.states, seen = _start_all(self.env, _key(self), self.num_envs, self.params)
         return np.array(seen), {}
 
     def step(
