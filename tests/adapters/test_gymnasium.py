@@ -13,8 +13,13 @@ from rp_jax.adapters import gymnasium as adapter
 from rp_jax.adapters import registry
 from rp_jax.envs import base
 
-IDS = {"circuit": "rp_jax/Circuit-v0", "jam": "rp_jax/Jam-v0"}
-SETTINGS = {"circuit": {"time_limit": 12}, "jam": {"time_limit": 12, "num_obstacles": 3}}
+SPECIAL = {"jam": {"num_obstacles": 3}}
+SETTINGS = {name: {"time_limit": 12, **SPECIAL.get(name, {})} for name in registry.ENVS}
+IDS = {
+    spec.kwargs["name"]: key
+    for key, spec in gymnasium.registry.items()
+    if key.startswith("rp_jax/")
+}
 ROWS = 6
 every_env = pytest.mark.parametrize("name", registry.ENVS)
 
@@ -34,6 +39,11 @@ def actions(name, steps, rows=ROWS):
 
 def same_bits(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def test_environments_are_registered_under_their_names():
+    assert set(IDS) == set(registry.ENVS)
+    assert IDS["jam"] == "rp_jax/Jam-v0"
 
 
 @every_env
