@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks import env_step, recon, tabular, threat_query, train_step
+from benchmarks import adapters, env_step, recon, tabular, threat_query, train_step
 from benchmarks.measure import Row, report
 
 BENCHMARKS: dict[str, Callable[[], list[Row]]] = {
@@ -13,6 +13,7 @@ BENCHMARKS: dict[str, Callable[[], list[Row]]] = {
     "threat_query": threat_query.run,
     "train_step": train_step.run,
     "tabular": tabular.run,
+    "adapters": adapters.run,
 }
 
 if __name__ == "__main__":

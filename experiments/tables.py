@@ -74,7 +74,7 @@ def _causes(causes: Mapping[str, int]) -> str:
 
 
 def percent(row: Mapping[str, Any]) -> str:
-    """A crash rate and its interval, in per cent."""
+    """The crash rate and its exact interval, in per cent."""
     low, high = (100 * bound for bound in row["crash_ci95"])
     return f"{100 * row['crash_rate']:.3f} [{low:.3f}, {high:.3f}]"
 

@@ -113,6 +113,12 @@ class AgentModel(struct.PyTreeNode):
         plans = len(self.baseline.target) if isinstance(self.baseline, Plans) else 1
         return plans * len(self.actions.acceleration)
 
+    @property
+    def shares(self) -> Array:
+        """(A, 2) the table's rows as the continuous actions that `control` takes for them."""
+        both = self.actions.acceleration, angle_of(self.actions.rotation)
+        return jnp.stack([part / jnp.max(jnp.abs(part)) for part in both], axis=-1)
+
     def control(self, action: Array) -> Control:
         """The command of an action: () int, a row of the table; or (2,) float, any in between.
 

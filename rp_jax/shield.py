@@ -66,6 +66,57 @@ def masked_argmax(values: Array, admissible: Array) -> Array:
     return jnp.argmax(jnp.where(admissible, values, -jnp.inf))
 
 
+class Correction(NamedTuple):
+    """What a shield makes of a policy's wish."""
+
+    action: Array  # () int, an admissible one
+    intervened: Array  # () bool, it is not the one wished for
+    secure: Array  # () bool, some action's threat is at most x
+
+
+def correct(
+    threat: Array, action: Array, x: Array | float, table: Array | None = None
+) -> Correction:
+    """The admissible action that comes closest to a policy's wish.
+
+    Args:
+        threat: (A,) action threats T(s, .).
+        action: the wish. () int: one action; if it is not admissible, the least threatening one is
+            taken. (A,) float: scores of all actions; the best admissible one is taken. With a
+            table, (D,) float: the nearest admissible row is taken.
+        x: threshold; infinity lets every wish pass.
+        table: (A, D) the actions that the threats are of.
+
+    Raises:
+        ValueError: the wish has a shape or type of none of these.
+    """
+    mask, secure = shield(threat, jnp.asarray(x))
+    scores = _preference(threat, action, table)
+    # Finite, so that masked_argmax tells the worst admissible one from those not admissible.
+    scores = jnp.nan_to_num(scores, nan=jnp.finfo(scores.dtype).min)
+    taken = masked_argmax(scores, mask)
+    return Correction(taken, taken != jnp.argmax(scores), secure)
+
+
+def _preference(threat: Array, action: Array, table: Array | None) -> Array:
+    """(A,) the higher, the more a wish allows for it."""
+    real = jnp.issubdtype(action.dtype, jnp.floating)
+    if table is not None:
+        shape: tuple[int, ...] = (table.shape[1],)
+        if real and action.shape == shape:
+            return -jnp.sum(jnp.square(action[None] - table), axis=-1)
+    else:
+        shape = threat.shape
+        if real and action.shape == shape:
+            return action
+        if jnp.issubdtype(action.dtype, jnp.integer) and action.shape == ():
+            return jnp.where(jnp.arange(len(threat)) == action, jnp.inf, -threat)
+    raise ValueError(
+        f"action is {action.dtype} of shape {action.shape}; it must be "
+        f"{'' if table is not None else 'an integer, or '}floats of shape {shape}"
+    )
+
+
 def masked_sample(key: Array, admissible: Array) -> Array:
     """() int, uniform over the admissible actions."""
     rank = jnp.cumsum(admissible)

@@ -112,6 +112,36 @@ def test_importing_the_core_loads_none_of_them():
     assert run("\n".join(lines)) == []
 
 
+@pytest.mark.parametrize(("adapter", "library"), [("brax", "brax"), ("gymnasium", "gymnasium")])
+def test_each_adapter_alone_imports_its_library(adapter, library):
+    users = {
+        name
+        for name, tree in modules().items()
+        if library in {imported.split(".")[0] for imported in imports(tree)}
+    }
+    assert users == {f"rp_jax.adapters.{adapter}"}
+    others = [name for name in FOREIGN if name != library]
+    loaded = f"print(*[m for m in {others!r} if m in sys.modules])"
+    assert run(f"import rp_jax.adapters.{adapter}, sys; {loaded}") == []  # nor is it noisy
+    assert run("import rp_jax.adapters.registry, sys; print('brax' in sys.modules)") == ["False"]
+
+
+@pytest.mark.parametrize(
+    ("adapter", "advice"),
+    [("brax", "pip install brax"), ("gymnasium", r"pip install 'rp_jax[gymnasium]'")],
+)
+def test_without_its_library_an_adapter_says_what_to_install(adapter, advice):
+    lines = [
+        "import sys",
+        f"sys.modules[{adapter!r}] = None",
+        "try:",
+        f"    import rp_jax.adapters.{adapter}",
+        "except ImportError as error:",
+        "    print(error)",
+    ]
+    assert advice in " ".join(run("\n".join(lines)))
+
+
 def test_the_command_lines_load_no_figures():
     names = ["experiments.jam", "experiments.circuit"]
     assert run(f"import {', '.join(names)}, sys; print('matplotlib' in sys.modules)") == ["False"]

@@ -203,6 +203,7 @@ def test_a_continuous_action_says_what_the_table_says_at_its_rows(task):
     for action, (acceleration, turn) in enumerate(pairs):
         row = agent.control(jnp.asarray(action))
         share = jnp.asarray([acceleration / strongest[0], turn / strongest[1]])
+        np.testing.assert_allclose(agent.shares[action], share, atol=1e-6)
         for scale in (1.0, 4.0) if abs(share).min() == 1 else (1.0,):  # greater ones are cut
             found = agent.control(scale * share)
             np.testing.assert_allclose(found.acceleration, row.acceleration, atol=1e-7)

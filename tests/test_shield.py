@@ -8,6 +8,7 @@ from hypothesis.extra import numpy as hnp
 from scipy import stats
 
 from rp_jax.shield import (
+    correct,
     from_bits,
     greedy_eta,
     masked_argmax,
@@ -108,6 +109,53 @@ def test_the_greatest_admissible_value_lies_inside_the_mask(values, mask):
 def test_the_mask_hides_even_the_greatest_value():
     values, mask = jnp.asarray([9.0, -3.0, -2.0]), jnp.asarray([False, True, True])
     assert masked_argmax(values, mask) == 2
+
+
+wild = st.one_of(some, st.sampled_from([np.nan, np.inf, -np.inf, -1.0])).map(np.float32)
+correct_jit = jax.jit(correct)
+PLACES = np.asarray([[0, 0], [1, 0], [0, 1], [-1, 0], [0.5, 0.5]], np.float32)
+
+
+@given(threats, hnp.arrays(np.float32, A, elements=wild), thresholds)
+def test_of_scores_the_best_admissible_one_is_taken_whatever_they_are(threat, scores, x):
+    found, mask = correct_jit(threat, scores, x), np.asarray(protect(threat, x).admissible)
+    assert mask[found.action]
+    rank = np.nan_to_num(scores, nan=np.finfo(np.float32).min)
+    assert rank[found.action] == rank[mask].max()
+    assert bool(found.intervened) == (int(found.action) != int(np.argmax(rank)))
+    assert bool(found.secure) == bool((threat <= x).any())
+
+
+@given(threats, st.integers(0, A - 1), thresholds)
+def test_an_action_passes_if_admissible_and_gives_way_to_the_least_threatening(threat, wish, x):
+    found, mask = correct_jit(threat, wish, x), np.asarray(protect(threat, x).admissible)
+    assert int(found.action) == (wish if mask[wish] else int(greedy_eta(threat)))
+    assert bool(found.intervened) == (not mask[wish])
+
+
+@given(threats, hnp.arrays(np.float32, 2, elements=st.floats(-2, 2, width=32)), thresholds)
+def test_a_continuous_action_gives_way_to_the_nearest_admissible_row(threat, wish, x):
+    found, mask = correct_jit(threat, wish, x, PLACES), np.asarray(protect(threat, x).admissible)
+    distance = np.linalg.norm(PLACES - wish, axis=1)
+    assert mask[found.action]
+    assert distance[found.action] <= distance[mask].min() + 1e-6
+    assert bool(found.intervened) <= (distance[found.action] >= distance.min())
+
+
+@pytest.mark.parametrize(
+    ("wish", "table", "allowed"),
+    [
+        (jnp.zeros(A - 1), None, r"an integer, or floats of shape \(5,\)"),
+        (jnp.asarray(0.5), None, r"an integer, or floats of shape \(5,\)"),
+        (jnp.zeros(A, int), None, r"an integer, or floats of shape \(5,\)"),
+        (jnp.asarray(True), None, r"an integer, or floats of shape \(5,\)"),
+        (jnp.asarray(1), PLACES, r"floats of shape \(2,\)"),
+        (jnp.zeros(3), PLACES, r"floats of shape \(2,\)"),
+    ],
+)
+def test_a_wish_of_another_shape_or_type_is_refused(wish, table, allowed):
+    with pytest.raises(ValueError, match=rf"^action is .*; it must be {allowed}$"):
+        correct(jnp.zeros(A), wish, 0.1, table)
 
 
 def test_samples_are_uniform_over_every_mask():

@@ -9,7 +9,7 @@ import probe
 import pytest
 from quick import unoptimised
 
-from benchmarks import env_step, measure, recon, setups, tabular, threat_query, train_step
+from benchmarks import adapters, env_step, measure, recon, setups, tabular, threat_query, train_step
 from benchmarks.measure import Row
 from experiments import circuit, jam
 
@@ -75,11 +75,11 @@ def test_each_benchmark_has_a_command_line_that_is_read_first(tmp_path, monkeypa
 
 
 def test_all_benchmarks_are_run_by_the_package(tmp_path, monkeypatch):
-    for module in (env_step, recon, threat_query, train_step, tabular):
+    for module in (env_step, recon, threat_query, train_step, tabular, adapters):
         monkeypatch.setattr(module, "run", lambda: [ROW])
     monkeypatch.setattr("sys.argv", ["benchmarks", "--out", str(tmp_path)])
     runpy.run_module("benchmarks", run_name="__main__")
-    names = {"env_step", "recon", "threat_query", "train_step", "tabular"}
+    names = {"env_step", "recon", "threat_query", "train_step", "tabular", "adapters"}
     assert {path.stem for path in tmp_path.iterdir()} == names
 
 
@@ -156,3 +156,19 @@ def test_solving_cmdps_is_measured_beside_a_linear_program():
     rows = tabular.run(batches=(2,), programs=2)
     assert [row.name for row in rows] == ["Algorithm 1", "linear program"]
     assert all(0 < row.slowest <= row.per_second <= row.fastest for row in rows)
+
+
+@pytest.mark.slow
+def test_gymnasium_is_measured_beside_the_step_that_it_calls(monkeypatch):
+    monkeypatch.setattr(adapters, "STEPS", 2)
+    monkeypatch.setattr(adapters, "REPEATS", 2)
+    rows = adapters.run(4)
+    assert [row.unit for row in rows] == 2 * ["steps", "steps", "ratio"]
+    assert all(0 < row.slowest <= row.per_second <= row.fastest for row in rows)
+
+
+def test_programs_are_timed_by_turns():
+    calls = []
+    rates = adapters.alternated([lambda a: calls.append(("a", a)), calls.append], [1, 2])
+    assert [len(found) for found in rates] == [adapters.REPEATS, adapters.REPEATS]
+    assert calls[:8] == 2 * [("a", 1), ("a", 2), 1, 2]  # the first round warms up

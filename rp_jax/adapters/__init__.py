@@ -1,0 +1,1 @@
+"""Environments and shield for other libraries; each module is the only importer of its library."""

@@ -1,0 +1,262 @@
+"""Environments as gymnasium's, singly and by the batch, and the shield for any of its own.
+
+Importing this module registers every environment: `gymnasium.make("rp_jax/Jam-v0")`, and
+`gymnasium.make_vec("rp_jax/Jam-v0", num_envs=1024)` for a batch in one compiled program.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rp_jax import shield
+from rp_jax.adapters import registry
+from rp_jax.envs import base
+from rp_jax.validate import positive
+
+try:
+    import gymnasium
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
+except ImportError as error:
+    raise ImportError(
+        "rp_jax.adapters.gymnasium needs gymnasium 1.1 or newer (pip install 'rp_jax[gymnasium]')"
+    ) from error
+
+FARTHEST = 100.0  # bound of what is observed beside the LIDAR; gymnasium wants a finite one
+
+
+def _spaces(env: base.Env, params: Any) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Discrete]:
+    """Of observations and actions; a LIDAR sees shares in [0, 1] of its range."""
+    sizes = env.LIDAR_BINS, len(env.SCALE)
+    low, high = (
+        np.repeat(np.asarray(ends, np.float32), sizes) for ends in ((0, -FARTHEST), (1, FARTHEST))
+    )
+    return gymnasium.spaces.Box(low, high), gymnasium.spaces.Discrete(env.num_actions(params))
+
+
+def _checked(action: Any, shape: tuple[int, ...], count: int) -> np.ndarray:
+    """The action(s) as int32.
+
+    Raises:
+        ValueError: not of this shape, not integers, or not in [0, count).
+    """
+    given = np.asarray(action)
+    if given.shape != shape or not np.issubdtype(given.dtype, np.integer):
+        raise ValueError(
+            f"action is {given.dtype} of shape {given.shape}; it must be integers of shape {shape}"
+        )
+    if given.size and (given.min() < 0 or given.max() >= count):
+        raise ValueError(
+            f"action is between {given.min()} and {given.max()}; it must be between 0 and "
+            f"{count - 1}"
+        )
+    return given.astype(np.int32)
+
+
+def _key(env: Any) -> jax.Array:
+    """From gymnasium's own source of randomness, which a seed has been given to."""
+    return jax.random.key(int(env.np_random.integers(2**31)))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _start(env: base.Env, key: jax.Array, params: Any) -> tuple:
+    """(key to go on with, state, observation)."""
+    key, now = jax.random.split(key)
+    state = env.reset(now, params)
+    return key, state, env.observe(state, params)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _advance(env: base.Env, key: jax.Array, state: Any, action: Any, params: Any) -> tuple:
+    """(key to go on with, state, observation, outcome)."""
+    key, now = jax.random.split(key)
+    reached, outcome = env.step(now, state, action, params)
+    return key, reached, env.observe(reached, params), outcome
+
+
+@functools.partial(jax.jit, static_argnums=(0, 2))
+def _start_all(env: base.Env, key: jax.Array, count: int, params: Any) -> tuple:
+    """`_start` with a leading axis (count,)."""
+    key, now = jax.random.split(key)
+    states = jax.vmap(env.reset, (0, None))(jax.random.split(now, count), params)
+    return key, states, jax.vmap(env.observe, (0, None))(states, params)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _advance_all(env: base.Env, key: jax.Array, states: Any, actions: Any, params: Any) -> tuple:
+    """(key to go on with, states and observations to go on from, those reached, outcomes)."""
+    key, now = jax.random.split(key)
+    keys = jax.random.split(now, len(actions))
+    look = lambda states: jax.vmap(env.observe, (0, None))(states, params)  # noqa: E731
+    carried, reached, outcome = base.step_and_renew(env, keys, states, actions, params, look)
+    return key, *carried, reached[1], outcome
+
+
+class Env(gymnasium.Env[np.ndarray, np.int64]):
+    """One environment; `state` is its true state, `info["cost"]` the danger of the step."""
+
+    metadata = {"render_modes": []}  # noqa: RUF012 (gymnasium's way)
+
+    def __init__(self, name: str, **settings: Any):
+        """Of a registered name, with the settings of its `make_params`."""
+        self.env, self.params = registry.make(name, **settings)
+        self.observation_space, self.action_space = _spaces(self.env, self.params)
+        self.state: Any = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """A start drawn anew; `seed` makes it and all that follow repeatable."""
+        super().reset(seed=seed)
+        self._key, self.state, seen = _start(self.env, _key(self), self.params)
+        return np.array(seen), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One transition.
+
+        Raises:
+            ValueError: the action is no integer, or out of range.
+            gymnasium.error.ResetNeeded: before the first `reset`.
+        """
+        _reset_first(self.state)
+        taken = _checked(action, (), self.env.num_actions(self.params))
+        self._key, self.state, seen, outcome = _advance(
+            self.env, self._key, self.state, taken, self.params
+        )
+        ended = bool(outcome.terminated), bool(outcome.truncated)
+        info = {"cost": float(outcome.danger), "goal": bool(outcome.goal)}
+        return np.array(seen), float(outcome.reward), *ended, info
+
+
+class JaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """A batch in one compiled program; a start is drawn anew in the step that ends an episode.
+
+    What the step itself led to is in `info`: "cost" and "goal" of every row, and of rows that
+    ended the observation "final_obs" and once more cost and goal as "final_info".
+    """
+
+    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    def __init__(self, name: str, num_envs: int = 1, **settings: Any):
+        """Of a registered name, with the settings of its `make_params`."""
+        self.num_envs = int(positive("num_envs", num_envs, integer=True))
+        self.env, self.params = registry.make(name, **settings)
+        self.single_observation_space, self.single_action_space = _spaces(self.env, self.params)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.states: Any = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Starts drawn anew; `seed` makes them and all that follow repeatable."""
+        super().reset(seed=seed)
+        self._key, self.states, seen = _start_all(self.env, _key(self), self.num_envs, self.params)
+        return np.array(seen), {}
+
+    def step(
+        self, actions: Any
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One transition of every row.
+
+        Raises:
+            ValueError: the actions are no integers (num_envs,), or out of range.
+            gymnasium.error.ResetNeeded: before the first `reset`.
+        """
+        _reset_first(self.states)
+        taken = _checked(actions, (self.num_envs,), self.env.num_actions(self.params))
+        self._key, self.states, seen, last, outcome = _advance_all(
+            self.env, self._key, self.states, taken, self.params
+        )
+        ended = np.array(outcome.terminated), np.array(outcome.truncated)
+        everywhere = np.ones(self.num_envs, bool)
+        costs = {"cost": np.array(outcome.danger), "goal": np.array(outcome.goal)}
+        info: dict[str, Any] = costs | {f"_{name}": everywhere.copy() for name in costs}
+        done = ended[0] | ended[1]
+        if done.any():
+            info |= _final(np.asarray(last), costs, done)
+        return np.array(seen), np.array(outcome.reward), *ended, info
+
+
+def _reset_first(state: Any) -> None:
+    if state is None:
+        raise gymnasium.error.ResetNeeded("step is called before reset")
+
+
+def _final(last: np.ndarray, costs: dict[str, np.ndarray], done: np.ndarray) -> dict[str, Any]:
+    """What gymnasium keeps of episodes that ended, next to a mask of the rows it is of."""
+    observations = np.full(len(done), None, object)
+    for row in np.flatnonzero(done):
+        observations[row] = last[row].copy()
+    kept = {name: np.where(done, value, 0).astype(value.dtype) for name, value in costs.items()}
+    told = kept | {f"_{name}": done.copy() for name in costs}
+    masks = {"_final_obs": done.copy(), "_final_info": done.copy()}
+    return {"final_obs": observations, "final_info": told, **masks}
+
+
+class Shielded(gymnasium.Wrapper):
+    """Lets no inadmissible action through where there is an admissible one, whatever the policy.
+
+    For any gymnasium environment. `info` tells of each step whether the policy's choice was
+    replaced ("intervention") and whether no action was admissible ("insecure"); then the least
+    threatening one is taken.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        threat: Callable[[Any], Any],
+        x: float,
+        table: np.ndarray | None = None,
+        state: Callable[[Any], Any] | None = None,
+    ):
+        """The threat is asked before every step.
+
+        Args:
+            env: with Discrete actions that begin at 0, or with a table Box actions (D,).
+            threat: maps a state to the threats (A,) of its actions.
+            x: largest admissible threat; infinity lets everything pass.
+            table: (A, D) the actions that threats are given for, where they are continuous.
+            state: finds the state in the unwrapped environment; else it is the last observation.
+        """
+        super().__init__(env)
+        self._threat, self._find, self._seen = threat, state, None
+        self._table = table
+        rows = None if table is None else jnp.asarray(table)
+        self._correct = jax.jit(functools.partial(shield.correct, x=x, table=rows))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """As without a shield."""
+        self._seen, info = self.env.reset(seed=seed, options=options)
+        return self._seen, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """One transition under the nearest thing to `action` that is admissible.
+
+        Args:
+            action: an integer, whose substitute is the least threatening action; or (A,) floats,
+                the policy's scores, whose substitute is its next best; or with a table (D,)
+                floats, taken for the nearest row, whose substitute is the nearest admissible one.
+        """
+        state = self._seen if self._find is None else self._find(self.env.unwrapped)
+        chosen = self._correct(jnp.asarray(self._threat(state)), jnp.asarray(action))
+        row = int(chosen.action)
+        taken = row if self._table is None else self._table[row]
+        self._seen, reward, terminated, truncated, info = self.env.step(taken)
+        told = {"intervention": bool(chosen.intervened), "insecure": not bool(chosen.secure)}
+        return self._seen, reward, terminated, truncated, info | told
+
+
+for _name in registry.ENVS:
+    gymnasium.register(
+        f"rp_jax/{_name.title().replace('_', '')}-v0",
+        entry_point="rp_jax.adapters.gymnasium:Env",
+        vector_entry_point="rp_jax.adapters.gymnasium:JaxVectorEnv",
+        kwargs={"name": _name},
+    )

@@ -1,0 +1,19 @@
+"""The environments that the adapters offer, by name."""
+
+from typing import Any
+
+from rp_jax.envs import circuit, jam
+from rp_jax.envs.base import Env
+from rp_jax.validate import one_of
+
+ENVS: dict[str, Any] = {"circuit": circuit, "jam": jam}
+
+
+def make(name: str, **settings: Any) -> tuple[Env, Any]:
+    """The environment and its parameters, from the settings of its `make_params`.
+
+    Raises:
+        ValueError: there is no such environment, or a setting is out of range.
+    """
+    env = ENVS[one_of("name", name, ENVS)]
+    return env, env.make_params(**settings)

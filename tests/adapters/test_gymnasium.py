@@ -1,0 +1,300 @@
+import functools
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from quick import compile_soon  # noqa: F401
+
+from rp_jax.adapters import gymnasium as adapter
+from rp_jax.adapters import registry
+from rp_jax.envs import base
+
+SPECIAL = {"jam": {"num_obstacles": 3}}
+SETTINGS = {name: {"time_limit": 12, **SPECIAL.get(name, {})} for name in registry.ENVS}
+IDS = {
+    spec.kwargs["name"]: key
+    for key, spec in gymnasium.registry.items()
+    if key.startswith("rp_jax/")
+}
+ROWS = 6
+every_env = pytest.mark.parametrize("name", registry.ENVS)
+
+
+def make(name):
+    return gymnasium.make(IDS[name], **SETTINGS[name])
+
+
+def make_vec(name, rows=ROWS):
+    return gymnasium.make_vec(IDS[name], num_envs=rows, **SETTINGS[name])
+
+
+def actions(name, steps, rows=ROWS):
+    count = registry.make(name)[0].num_actions(registry.make(name)[1])
+    return np.random.default_rng(0).integers(count, size=(steps, rows))
+
+
+def same_bits(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def test_environments_are_registered_under_their_names():
+    assert set(IDS) == set(registry.ENVS)
+    assert IDS["jam"] == "rp_jax/Jam-v0"
+
+
+@every_env
+def test_an_environment_passes_the_checks_of_gymnasium(name):
+    check_env(make(name).unwrapped)
+
+
+@every_env
+def test_transitions_are_those_of_the_environment_bit_for_bit(name):
+    env = make(name)
+    inner = env.unwrapped
+    task, params = inner.env, inner.params
+    step, observe = jax.jit(task.step), jax.jit(task.observe)
+    env.reset(seed=3)
+    for action in actions(name, 10)[:, 0]:
+        key = jax.random.split(inner._key)[1]
+        reached, outcome = step(key, inner.state, jnp.asarray(action, jnp.int32), params)
+        seen, reward, terminated, truncated, info = env.step(action)
+        same_bits(inner.state, reached)
+        np.testing.assert_array_equal(seen, observe(reached, params))
+        assert (reward, terminated, truncated) == (
+            outcome.reward,
+            outcome.terminated,
+            outcome.truncated,
+        )
+        assert info == {"cost": outcome.danger, "goal": outcome.goal}
+        assert seen.flags.writeable
+        if terminated or truncated:
+            break
+
+
+@functools.cache
+def stepper(name):
+    env = make_vec(name)
+    task, params = env.env, env.params
+
+    @jax.jit
+    def advance(key, states, action):
+        keys = jax.random.split(jax.random.split(key)[1], ROWS)
+        carried, reached, outcome = base.auto_reset_step(task, keys, states, action, params)
+        look = jax.vmap(task.observe, (0, None))
+        return carried, look(carried, params), look(reached, params), outcome
+
+    return advance
+
+
+@every_env
+def test_a_batch_takes_the_same_steps_and_keeps_what_an_episode_ended_with(name):
+    env, ends = make_vec(name), {"terminated": 0, "truncated": 0}
+    seen, info = env.reset(seed=0)
+    assert info == {}
+    assert seen in env.observation_space
+    for action in actions(name, 30):
+        args = env._key, env.states, action.astype(np.int32)
+        carried, observed, last, outcome = stepper(name)(*args)
+        seen, reward, terminated, truncated, info = env.step(action)
+        same_bits(env.states, carried)
+        np.testing.assert_array_equal(seen, observed)
+        np.testing.assert_array_equal(reward, outcome.reward)
+        np.testing.assert_array_equal(terminated, outcome.terminated)
+        np.testing.assert_array_equal(truncated, outcome.truncated)
+        np.testing.assert_array_equal(info["cost"], outcome.danger)
+        np.testing.assert_array_equal(info["goal"], outcome.goal)
+        assert not (terminated & truncated).any()
+        done = terminated | truncated
+        assert ("final_obs" in info) == done.any()
+        for row in np.flatnonzero(done):
+            np.testing.assert_array_equal(info["final_obs"][row], last[row])
+            assert (seen[row] != last[row]).any()
+            assert info["final_info"]["cost"][row] == outcome.danger[row]
+        if done.any():
+            assert all(info["final_obs"][row] is None for row in np.flatnonzero(~done))
+            np.testing.assert_array_equal(info["_final_obs"], done)
+        ends["terminated"] += terminated.sum()
+        ends["truncated"] += truncated.sum()
+    assert min(ends.values()) > 0
+
+
+def test_a_batch_tells_what_gymnasiums_own_batches_tell():
+    ours = make_vec("circuit", 2)
+    theirs = SyncVectorEnv([lambda: make("circuit")] * 2, autoreset_mode=AutoresetMode.SAME_STEP)
+    assert ours.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    for env in (ours, theirs):
+        env.reset(seed=0)
+    for t in range(12):  # at a standstill nothing is hit
+        results = [env.step(np.full(2, 7)) for env in (ours, theirs)]
+        infos = [result[-1] for result in results]
+        for a, b in zip(*(result[:-1] for result in results), strict=True):
+            assert a.shape == b.shape
+        np.testing.assert_array_equal(results[0][3], t == 11)
+    assert set(infos[0]) >= set(infos[1])
+    assert set(infos[0]["final_info"]) == set(infos[1]["final_info"])
+    for name in ("final_obs", "_final_obs", "_final_info"):
+        assert infos[0][name].dtype == infos[1][name].dtype
+        assert infos[0][name].shape == infos[1][name].shape
+
+
+@every_env
+def test_a_seed_repeats_everything_and_starts_differ_without_one(name):
+    def play(env):
+        steps = [env.step(action) for action in actions(name, 15)]
+        return [step[0] for step in steps]
+
+    env = make_vec(name)
+    first, _ = env.reset(seed=5)
+    one = play(env)
+    second, _ = env.reset()
+    assert (first != second).any(axis=1).all()
+    same_bits(env.reset(seed=5)[0], first)
+    same_bits(play(env), one)
+    assert len(np.unique(first, axis=0)) == ROWS
+    single = make(name)
+    starts = [single.reset(seed=5)[0], single.reset()[0], single.reset(seed=5)[0]]
+    same_bits(starts[0], starts[2])
+    assert (starts[0] != starts[1]).any()
+
+
+def test_statistics_of_episodes_are_recorded():
+    env = gymnasium.wrappers.RecordEpisodeStatistics(make("circuit"))
+    env.reset(seed=0)
+    rewards = [env.step(7) for _ in range(12)]
+    assert rewards[-1][-1]["episode"]["l"] == 12
+    assert rewards[-1][-1]["episode"]["r"] == sum(step[1] for step in rewards)
+
+
+def test_statistics_of_episodes_of_a_batch_are_recorded():
+    env = gymnasium.wrappers.vector.RecordEpisodeStatistics(make_vec("jam"), buffer_length=1000)
+    env.reset(seed=0)
+    score, length, told = np.zeros(ROWS), np.zeros(ROWS, int), []
+    for action in actions("jam", 40):
+        _, reward, terminated, truncated, info = env.step(action)
+        score, length, done = score + reward, length + 1, terminated | truncated
+        if done.any():
+            np.testing.assert_allclose(info["episode"]["r"][done], score[done], rtol=1e-5)
+            np.testing.assert_array_equal(info["episode"]["l"][done], length[done])
+            told += list(length[done])
+        score, length = np.where(done, 0, score), np.where(done, 0, length)
+    assert len(told) > ROWS
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (15, "between 15 and 15; it must be between 0 and 14"),
+        (-1, "between -1 and -1"),
+        (1.0, "float64 of shape"),
+        (True, "bool of shape"),
+        ([1], r"int64 of shape \(1,\); it must be integers of shape \(\)"),
+        (None, "object of shape"),
+    ],
+)
+def test_bad_actions_are_refused(action, message):
+    env = make("circuit").unwrapped
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=f"^action is {message}"):
+        env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros(ROWS - 1, int), rf"int64 of shape \({ROWS - 1},\); it must be integers of shape"),
+        (np.zeros((ROWS, 1), int), "int64 of shape"),
+        (np.zeros(ROWS), "float64 of shape"),
+        (np.asarray([0] * (ROWS - 1) + [15]), "between 0 and 15"),
+    ],
+)
+def test_bad_batches_of_actions_are_refused(action, message):
+    env = make_vec("circuit")
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=f"^action is {message}"):
+        env.step(action)
+
+
+def test_other_bad_input_is_refused():
+    with pytest.raises(ValueError, match=r"^name is 'jem'"):
+        adapter.Env("jem")
+    with pytest.raises(ValueError, match=r"^num_envs is 0"):
+        adapter.JaxVectorEnv("jam", 0)
+    for env in (adapter.Env("circuit"), adapter.JaxVectorEnv("circuit", 2)):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="before reset"):
+            env.step(np.zeros(getattr(env, "num_envs", ()), int))
+
+
+def lake_threat(state):
+    """LEFT is never dangerous, UP a little, the others are."""
+    return np.asarray([0.0, 0.9, 0.8, 0.05]) + 0.0 * state
+
+
+def test_a_shield_around_any_environment_replaces_and_tells():
+    env = adapter.Shielded(gymnasium.make("FrozenLake-v1", is_slippery=False), lake_threat, 0.1)
+    env.reset(seed=0)
+    for wish, taken in (
+        (0, 0),
+        (1, 0),
+        (3, 3),
+        (np.int64(2), 0),
+        (np.asarray([0.1, 9.0, 0.3, 0.2], np.float32), 3),
+    ):
+        *_, info = env.step(wish)
+        assert env.unwrapped.lastaction == taken
+        wished = np.argmax(wish) if np.ndim(wish) else wish
+        assert info["intervention"] == (wished != taken)
+        assert not info["insecure"]
+        assert "prob" in info  # what the environment itself tells is kept
+
+
+def test_a_shield_finds_the_state_where_it_is_told_to_and_never_lets_a_worse_action_pass():
+    seen = []
+
+    def threat(state):
+        seen.append(state)
+        return np.asarray([0.9, 0.8])
+
+    env = gymnasium.make("CartPole-v1")
+    env = adapter.Shielded(env, threat, 0.1, state=lambda inner: inner.state)
+    env.reset(seed=0)
+    state = env.unwrapped.state
+    *_, info = env.step(0)
+    np.testing.assert_array_equal(seen[0], state)
+    assert info["intervention"]
+    assert info["insecure"]
+
+
+def test_a_shield_takes_the_nearest_admissible_row_of_a_continuous_action():
+    table = np.asarray([[-2.0], [-1.0], [0.0], [1.0], [2.0]], np.float32)
+    threat = lambda _: np.asarray([0.0, 0.0, 0.9, 0.9, 0.0])  # noqa: E731
+    env = adapter.Shielded(gymnasium.make("Pendulum-v1"), threat, 0.1, table)
+    env.reset(seed=0)
+    for wish, taken, replaced in ((-1.2, -1.0, False), (0.3, -1.0, True), (0.9, 2.0, True)):
+        *_, info = env.step(np.asarray([wish], np.float32))
+        assert env.unwrapped.last_u == taken
+        assert info["intervention"] == replaced
+
+
+def test_ours_can_be_shielded_too():
+    threat = lambda state: jnp.where(jnp.arange(15) < 10, 0.0, state.agent.speed + 1.0)  # noqa: E731
+    env = adapter.Shielded(make("jam"), threat, 0.5, state=lambda env: env.state)
+    env.reset(seed=0)
+    for _ in range(5):
+        assert env.step(14)[-1]["intervention"]
+    assert env.unwrapped.state.agent.speed < 0  # it backs off, and was told to speed up
+
+
+@pytest.mark.slow
+def test_stable_baselines_learns_from_it():
+    sb3 = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
+    learner = sb3.DQN(
+        "MlpPolicy", make("circuit"), learning_starts=50, buffer_size=500, seed=0, device="cpu"
+    )
+    assert learner.learn(400).num_timesteps == 400
+    assert len(learner.ep_info_buffer) >= 400 // 12
