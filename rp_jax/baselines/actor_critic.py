@@ -24,7 +24,7 @@ class ActorCriticConfig:
     """Sizes of the batches, and how they are turned into advantages."""
 
     policy: str = "gaussian"  # or "categorical", over the environment's discrete actions
-    num_envs: int = 64
+    num_envs: int = 256
     length: int = 64  # steps of each environment in a batch
     gamma: float = 0.995  # discount of reward
     beta: float = 0.995  # discount of danger in its advantages; limits are of undiscounted danger
@@ -248,11 +248,19 @@ def update_critic(state: State, batch: Batch, pmdp: PMDP, config: ActorCriticCon
 def pass_over(
     key: Array,
     carry: Any,
-    batch: Batch,
-    update: Callable[[Any, Batch], Any],
+    batch: Any,
+    update: Callable[[Any, Any], Any],
     config: ActorCriticConfig,
 ) -> Any:
-    """`epochs` times all of the batch in a random order, an update for each minibatch."""
+    """`epochs` times all of the batch in a random order, an update for each minibatch.
+
+    Args:
+        key: of the orders.
+        carry: what is updated.
+        batch: pytree with leading axis (steps,).
+        update: maps what is carried and a minibatch, a part of `batch`, to what is carried on.
+        config: sizes.
+    """
 
     def epoch(carry, key):
         order = jax.random.permutation(key, config.steps).reshape(config.minibatches, -1)

@@ -57,15 +57,27 @@ class Metrics(NamedTuple):
 
 
 def fisher_product(
-    divergence: Callable[[Array], Array], theta: Array, damping: float
+    policy: Callable[[Array], Any], theta: Array, damping: float
 ) -> Callable[[Array], Array]:
     """The product of the Fisher matrix at `theta` (P,), damped, with a vector (P,).
 
-    It is the Hessian of the mean KL divergence from the policy at `theta`, differentiated forward
-    over backward.
+    The matrix is J'MJ, the Hessian of the mean KL divergence from the policy at `theta`: J is the
+    Jacobian of the distributions' parameters, M the Hessian of the divergence in these.
+
+    Args:
+        policy: distributions of a batch of states, for weights (P,).
+        theta: (P,) weights.
+        damping: added to the diagonal.
     """
-    _, hessian = jax.linearize(jax.grad(divergence), theta)
-    return lambda vector: hessian(vector) + damping * vector
+    old, push = jax.linearize(policy, theta)
+    pull = jax.linear_transpose(push, theta)
+    slope = jax.grad(lambda new: jnp.mean(old.kl(new)))
+
+    def product(vector: Array) -> Array:
+        _, bent = jax.jvp(slope, (old,), (push(vector),))
+        return pull(bent)[0] + damping * vector
+
+    return product
 
 
 def step_lengths(
@@ -121,10 +133,13 @@ def improve(
         excess: () danger per step, beyond what the limit allows.
         config: hyperparameters.
     """
-    old: Any = network.apply(params, batch.encoded)
-    before = old.log_prob(batch.action)
     theta, unravel = ravel_pytree(params)
-    policy = lambda theta: network.apply(unravel(theta), batch.encoded)  # noqa: E731
+
+    def policy(theta: Array) -> Any:
+        return network.apply(unravel(theta), batch.encoded)
+
+    old = policy(theta)
+    before = old.log_prob(batch.action)
     advantage = batch.advantage - jnp.mean(batch.advantage, axis=0, keepdims=True)
 
     def surrogates(theta: Array) -> Array:
@@ -136,7 +151,7 @@ def improve(
         return jnp.mean(old.kl(policy(theta)))
 
     g, b = jax.jacrev(surrogates)(theta)
-    product = fisher_product(divergence, theta, config.damping)
+    product = fisher_product(policy, theta, config.damping)
     v, w = (cg(product, a, tol=0.0, maxiter=config.products)[0] for a in (g, b))
     along, against, case = step_lengths(g @ v, g @ w, b @ w, excess, config.divergence)
     direction = along * v - against * w
@@ -150,8 +165,11 @@ def improve(
         fine &= (change[REWARD] >= 0) | (excess > 0)
         return count + 1, jnp.where(fine, new, theta), jnp.where(fine, kl, 0.0), fine
 
+    def going(carry):
+        count, *_, fine = carry
+        return ~fine & (count < config.backtracks)
+
     begin = (jnp.asarray(0), theta, jnp.zeros_like(excess), jnp.asarray(False))
-    going = lambda c: ~c[3] & (c[0] < config.backtracks)  # noqa: E731
     _, theta, kl, accepted = jax.lax.while_loop(going, attempt, begin)
     return unravel(theta), Update(kl, case, accepted)
 
@@ -176,9 +194,10 @@ def step(state: State, pmdp: PMDP, limit: Array, config: CPOConfig) -> tuple[Sta
     excess = (metrics.danger - limit * metrics.episodes) / metrics.steps
     network = actor_critic.make_actor(pmdp, config.rollout)
     actor, update = improve(state.actor, network, batch, excess, config)
-    learn = lambda state, part: actor_critic.update_critic(  # noqa: E731
-        state, part, pmdp, config.rollout
-    )
+
+    def learn(state: State, part: Batch) -> State:
+        return actor_critic.update_critic(state, part, pmdp, config.rollout)
+
     state = state._replace(actor=actor, key=key)
     state = actor_critic.pass_over(fit_key, state, batch, learn, config.rollout)
     return state, Metrics(metrics, update)

@@ -88,7 +88,7 @@ def objective(
 
 
 def penalised(advantage: Array, penalty: Array) -> Array:
-    """(N,) (A_r - lambda A_d) / (1 + lambda) of advantages (N, 2); Stooke et al., equation 7.
+    """(N,) (A_r - lambda A_d) / (1 + lambda) of advantages (N, 2).
 
     Advantages are not standardised: the controller's gains are in units of scaled reward.
     """

@@ -47,16 +47,21 @@ class Gaussian(NamedTuple):
 class Categorical(NamedTuple):
     """Probabilities of a finite number of actions."""
 
-    log_probs: Array  # (..., A) normalised
+    logits: Array  # (..., A)
+
+    @property
+    def log_probs(self) -> Array:
+        """(..., A) normalised."""
+        return nn.log_softmax(self.logits)
 
     @property
     def mode(self) -> Array:
         """(...) int, the likeliest action."""
-        return jnp.argmax(self.log_probs, axis=-1)
+        return jnp.argmax(self.logits, axis=-1)
 
     def sample(self, key: Array) -> Array:
         """(...) int, one action."""
-        return jax.random.categorical(key, self.log_probs)
+        return jax.random.categorical(key, self.logits)
 
     def log_prob(self, action: Array) -> Array:
         """(...) log probability of actions (...)."""
@@ -102,7 +107,7 @@ class CategoricalActor(nn.Module):
     def __call__(self, seen: Encoded) -> Categorical:
         """The distribution of actions (...) int."""
         logits = _perceptron(features(seen, self.scale), self.hidden, self.num_actions, "logits")
-        return Categorical(nn.log_softmax(logits))
+        return Categorical(logits)
 
 
 class Critic(nn.Module):
