@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from learning import ROLLOUT, danger_and_return
-from quick import compile_soon  # noqa: F401
+from quick import unoptimised
 from tabular import cases
 
 from rp_jax.baselines import pid_lagrangian
@@ -20,6 +20,12 @@ CONFIG = PIDConfig(rollout=ROLLOUT, learning_rate=1e-3)
 TRACED = []
 
 init = jax.jit(pid_lagrangian.init, static_argnums=2)
+
+
+@pytest.fixture
+def compile_soon():
+    with unoptimised():
+        yield
 
 
 @functools.partial(jax.jit, static_argnums=(3, 4))
@@ -80,7 +86,7 @@ def test_the_objective_is_clipped_on_the_side_of_gain():
     np.testing.assert_array_equal(np.abs(grads).sum(axis=-1) > 0, [False, True, True, False])
 
 
-def test_a_batch_without_an_end_keeps_the_last_measure():
+def test_a_batch_without_an_end_keeps_the_last_measure(compile_soon):
     model = finite.delayed(steps=9)
     pmdp = finite.pmdp_of(model)
     config = dataclasses.replace(CONFIG, rollout=dataclasses.replace(ROLLOUT, num_envs=4, length=4))
@@ -107,7 +113,7 @@ def test_on_a_finite_cmdp_it_keeps_the_limit_and_comes_near_the_optimum():
     assert metrics.penalty[-1] > 0.1
 
 
-def test_limits_and_seeds_side_by_side_learn_what_each_learns_alone():
+def test_limits_and_seeds_side_by_side_learn_what_each_learns_alone(compile_soon):
     model = cases.random_cmdp(3, gamma=1.0, beta=1.0)
     pmdp = finite.pmdp_of(model)
     config = dataclasses.replace(CONFIG, rollout=dataclasses.replace(ROLLOUT, num_envs=8, length=8))

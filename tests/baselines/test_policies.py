@@ -72,9 +72,9 @@ def test_modes_are_the_likeliest_actions():
 def test_a_fresh_policy_is_even_handed(name):
     network = ACTORS[name](num_actions=4, scale=SCALE)
     weights = network.init(jax.random.key(0), seen())
-    assert [layer["kernel"].shape for layer in weights["params"].values() if "kernel" in layer][
-        :2
-    ] == [(8, 64), (64, 32)]
+    name_of = {"gaussian": "mean", "categorical": "logits"}[name]
+    shapes = [weights["params"][f"{name_of}_{i}"]["kernel"].shape for i in range(2)]
+    assert shapes == [(8, 64), (64, 32)]
     policy = network.apply(weights, seen())
     if name == "gaussian":
         np.testing.assert_allclose(policy.mean, np.zeros((6, 2)), atol=0.2)

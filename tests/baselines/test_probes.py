@@ -10,7 +10,6 @@ import numpy as np
 import probe
 import pytest
 from learning import ROLLOUT, danger_and_return
-from quick import compile_soon  # noqa: F401
 
 from rp_jax import evaluate
 from rp_jax.baselines import actor_critic, cpo, pid_lagrangian
