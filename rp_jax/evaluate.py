@@ -13,6 +13,10 @@ from rp_jax import shield, statistics
 from rp_jax.envs.base import select
 from rp_jax.planning.pmdp import PMDP, Percept
 
+# Chooses for a batch of states: (key, percept) -> (actions (B,) or (B, 2), (B,) bool: these are
+# not the actions that it would have preferred).
+Policy = Callable[[Array, Percept], tuple[Array, Array]]
+
 
 class Episodes(NamedTuple):
     """One row per episode."""
@@ -31,6 +35,17 @@ def greedy(network: nn.Module, weights: Any) -> Callable[[Percept], Array]:
     return lambda percept: jnp.asarray(network.apply(weights, percept.encoded))
 
 
+def shielded(values: Callable[[Percept], Array]) -> Policy:
+    """Acts greedily inside the admissible set, by action values (B, A)."""
+
+    def choose(_: Array, percept: Percept) -> tuple[Array, Array]:
+        scores = values(percept)
+        action = jax.vmap(shield.masked_argmax)(scores, percept.admissible)
+        return action, jnp.argmax(scores, axis=-1) != action
+
+    return choose
+
+
 def run_episodes(
     key: Array,
     pmdp: PMDP,
@@ -44,17 +59,24 @@ def run_episodes(
     Args:
         key: its episodes are independent of every other key's.
         pmdp: the environment, the threats and the threshold.
-        values: scores the actions of a batch of states; any policy can be written so.
+        values: scores the actions of a batch of states.
         episodes: how many.
         batch: episodes simulated side by side.
 
     Returns:
         Rows with leading axis (episodes,).
     """
+    return play_episodes(key, pmdp, shielded(values), episodes, batch=batch)
+
+
+def play_episodes(
+    key: Array, pmdp: PMDP, policy: Policy, episodes: int, *, batch: int = 1000
+) -> Episodes:
+    """`run_episodes` of any policy, also of a random one or one with continuous actions."""
     rounds = -(-episodes // batch)
 
     def one_round(key: Array) -> Episodes:
-        start_key, step_key = jax.random.split(key)
+        start_key, step_key, act_key = jax.random.split(key, 3)
         keys = jax.random.split(step_key, batch)
         starts = jax.random.split(start_key, batch)
         states = jax.vmap(pmdp.env.reset, (0, None))(starts, pmdp.params)
@@ -68,9 +90,7 @@ def run_episodes(
         def advance(carry):
             t, alive, states, rows = carry
             percept = pmdp.perceive(states, alive)
-            scores = values(percept)
-            wish = jnp.argmax(scores, axis=-1)
-            action = jax.vmap(shield.masked_argmax)(scores, percept.admissible)
+            action, changed = policy(jax.random.fold_in(act_key, t), percept)
             step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, t)
             step = jax.vmap(pmdp.env.step, (0, 0, 0, None))
             reached, outcome = step(step_keys, states, action, pmdp.params)
@@ -80,7 +100,7 @@ def run_episodes(
                 danger=rows.danger + outcome.danger,
                 goal=outcome.goal,
                 length=rows.length + 1,
-                interventions=rows.interventions + (wish != action),
+                interventions=rows.interventions + changed,
                 insecure=rows.insecure + ~percept.secure,
                 causes=hit,
             )

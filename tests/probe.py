@@ -71,7 +71,7 @@ def reset(key, params):
 def step(key, state, action, params):
     slips = jax.random.bernoulli(key, params.slip)
     action = jnp.where(slips, STAY, action)
-    control = jax.tree.map(lambda table: table[action], params.agent.actions)
+    control = params.agent.control(action)
     reached = State(agent=params.agent.step(state.agent, control), time=state.time + 1)
     fell = causes(reached, params)["pit"]
     goal = reached.agent.position[0] <= COIN

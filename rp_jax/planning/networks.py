@@ -7,6 +7,13 @@ from jax import Array
 from rp_jax.planning.pmdp import Encoded
 
 
+def features(seen: Encoded, scale: tuple[float, ...]) -> Array:
+    """(..., L + R) all that is seen, of the order of 1: nearness, 0 where nothing is, and rest."""
+    scan = 1.0 - seen.scan.astype(seen.rest.dtype) / 255
+    factors = jnp.broadcast_to(jnp.asarray(scale, seen.rest.dtype), seen.rest.shape)
+    return jnp.concatenate([scan, seen.rest * factors], axis=-1)
+
+
 class TunedNetwork(nn.Module):
     """A perceptron on the pooled LIDAR and the rest of the observation."""
 
@@ -17,9 +24,7 @@ class TunedNetwork(nn.Module):
     @nn.compact
     def __call__(self, seen: Encoded) -> Array:
         """(..., A) action values."""
-        scan = 1.0 - seen.scan.astype(seen.rest.dtype) / 255
-        scale = jnp.broadcast_to(jnp.asarray(self.scale, seen.rest.dtype), seen.rest.shape)
-        x = jnp.concatenate([scan, seen.rest * scale], axis=-1)
+        x = features(seen, self.scale)
         for width in self.hidden:
             x = nn.silu(nn.Dense(width)(x))
         return nn.Dense(self.num_actions)(x)

@@ -185,6 +185,30 @@ def test_seeds_side_by_side_learn_what_each_learns_alone(compile_soon):
         np.testing.assert_allclose(mine.loss, metrics.loss, rtol=1e-2)
 
 
+def test_penalties_and_seeds_learn_as_one_program_what_each_learns_alone(compile_soon):
+    """Penalised DQN: every Lagrange coefficient and seed at once."""
+    config = dataclasses.replace(CONFIG, num_envs=8, batch=16, replay=160, replay_start=40)
+    pmdp = probe.make_pmdp(probe, PARAMS, x=np.inf)
+    sweep = jax.tree.map(lambda _: None, pmdp).replace(penalty=0)
+    penalties = jnp.asarray([0.0, 10.0])
+    keys = jax.random.split(jax.random.key(6), 2)
+
+    def train(key, pmdp):
+        state, _ = loop.init(key, pmdp, config)
+        return loop.chunk(state, pmdp, config, 10)[1]
+
+    grid = jax.vmap(jax.vmap(train, (0, None)), (None, sweep))
+    metrics = jax.jit(grid)(keys, pmdp.replace(penalty=penalties))
+    assert metrics.loss.shape == (2, 2)
+    alone = jax.jit(train)
+    for i, penalty in enumerate(penalties):
+        for j, key in enumerate(keys):
+            mine = alone(key, pmdp.replace(penalty=penalty))
+            np.testing.assert_allclose(mine.loss, metrics.loss[i, j], rtol=1e-2)
+            assert mine.crashes == metrics.crashes[i, j]
+    assert (metrics.loss[0] != metrics.loss[1]).any()  # where someone fell
+
+
 def test_a_chunk_is_compiled_once_whatever_the_values():
     learned("RP")
     before = len(TRACED)

@@ -1,0 +1,203 @@
+"""Constrained Policy Optimization (Achiam et al. 2017; appendix G.3)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from jax import Array
+from jax.flatten_util import ravel_pytree
+from jax.scipy.sparse.linalg import cg
+
+from rp_jax.baselines import actor_critic
+from rp_jax.baselines.actor_critic import DANGER, REWARD, ActorCriticConfig, Batch, State
+from rp_jax.planning.pmdp import PMDP
+from rp_jax.validate import number
+
+TINY = 1e-12  # keeps quotients of what may vanish finite
+UNCONSTRAINED, CONSTRAINED, RECOVERY = range(3)  # how a step was chosen
+
+
+@dataclass(frozen=True)
+class CPOConfig:
+    """Hyperparameters of the learner."""
+
+    rollout: ActorCriticConfig = field(default_factory=ActorCriticConfig)
+    divergence: float = 0.01  # delta, the trust region: greatest mean KL divergence of an update
+    damping: float = 0.01  # added to the diagonal of the Fisher matrix
+    products: int = 10  # conjugate gradient iterations
+    backtracks: int = 15  # attempts of the line search, each shorter by `shrink`
+    shrink: float = 0.8
+
+    def validate(self, name: str) -> None:
+        """Raises ValueError, naming the field after `name`, if a value is out of range."""
+        self.rollout.validate(f"{name}.rollout")
+        number(f"{name}.divergence", self.divergence, above=0)
+        number(f"{name}.damping", self.damping, least=0)
+        number(f"{name}.products", self.products, least=1, integer=True)
+        number(f"{name}.backtracks", self.backtracks, least=1, integer=True)
+        number(f"{name}.shrink", self.shrink, above=0, most=1)
+
+
+class Update(NamedTuple):
+    """What became of an update."""
+
+    kl: Array  # () mean divergence of the new policy from the old one
+    case: Array  # () int, UNCONSTRAINED, CONSTRAINED or RECOVERY
+    accepted: Array  # () bool, the line search found a step
+
+
+class Metrics(NamedTuple):
+    """Of one step."""
+
+    rollout: actor_critic.Metrics
+    update: Update
+
+
+def fisher_product(
+    policy: Callable[[Array], Any], theta: Array, damping: float
+) -> Callable[[Array], Array]:
+    """The product of the Fisher matrix at `theta` (P,), damped, with a vector (P,).
+
+    The matrix is J'MJ, the Hessian of the mean KL divergence from the policy at `theta`: J is the
+    Jacobian of the distributions' parameters, M the Hessian of the divergence in these.
+
+    Args:
+        policy: distributions of a batch of states, for weights (P,).
+        theta: (P,) weights.
+        damping: added to the diagonal.
+    """
+    old, push = jax.linearize(policy, theta)
+    pull = jax.linear_transpose(push, theta)
+    slope = jax.grad(lambda new: jnp.mean(old.kl(new)))
+
+    def product(vector: Array) -> Array:
+        _, bent = jax.jvp(slope, (old,), (push(vector),))
+        return pull(bent)[0] + damping * vector
+
+    return product
+
+
+def step_lengths(
+    q: Array, r: Array, s: Array, excess: Array, delta: float
+) -> tuple[Array, Array, Array]:
+    """Solves max g'x subject to excess + b'x <= 0 and x'Hx / 2 <= delta (equations 11 and 12).
+
+    With v = H^-1 g and w = H^-1 b the solution is x = along v - against w: `along` is 1 / lambda
+    and `against` nu / lambda in the dual's multipliers. Where the best step of the trust region
+    keeps the constraint, nu is 0; else the best one lies on both boundaries. Where no step of the
+    trust region keeps it, x reduces the danger as fast as can be (equation 14).
+
+    Args:
+        q: () g'v.
+        r: () g'w.
+        s: () b'w.
+        excess: () by how much the constraint is violated; negative where it is kept.
+        delta: radius of the trust region.
+
+    Returns:
+        (along, against, case).
+    """
+    free = jnp.sqrt(2 * delta / jnp.maximum(q, TINY))
+    slope = r / jnp.maximum(s, TINY)
+    left = 2 * delta - excess * excess / jnp.maximum(s, TINY)  # of the region, on the constraint
+    gain = jnp.maximum(q - r * slope, TINY)  # of reward along the constraint
+    bound = jnp.sqrt(jnp.maximum(left, 0.0) / gain)
+    case = jnp.where(
+        excess + free * r <= 0,
+        UNCONSTRAINED,
+        jnp.where((excess > 0) & (left < 0), RECOVERY, CONSTRAINED),
+    )
+    along = jnp.stack([free, bound, jnp.zeros_like(free)])
+    against = jnp.stack(
+        [
+            jnp.zeros_like(free),
+            bound * slope + excess / jnp.maximum(s, TINY),
+            jnp.sqrt(2 * delta / jnp.maximum(s, TINY)),
+        ]
+    )
+    return along[case], against[case], case
+
+
+def improve(
+    params: Any, network: nn.Module, batch: Batch, excess: Array, config: CPOConfig
+) -> tuple[Any, Update]:
+    """One update of the policy (Algorithm 1).
+
+    Args:
+        params: of the policy.
+        network: of the policy.
+        batch: drawn from it.
+        excess: () danger per step, beyond what the limit allows.
+        config: hyperparameters.
+    """
+    theta, unravel = ravel_pytree(params)
+
+    def policy(theta: Array) -> Any:
+        return network.apply(unravel(theta), batch.encoded)
+
+    old = policy(theta)
+    before = old.log_prob(batch.action)
+    advantage = batch.advantage - jnp.mean(batch.advantage, axis=0, keepdims=True)
+
+    def surrogates(theta: Array) -> Array:
+        """(2,) how reward and danger per step change."""
+        ratio = jnp.exp(policy(theta).log_prob(batch.action) - before)
+        return jnp.mean(ratio[:, None] * advantage, axis=0)
+
+    def divergence(theta: Array) -> Array:
+        return jnp.mean(old.kl(policy(theta)))
+
+    g, b = jax.jacrev(surrogates)(theta)
+    product = fisher_product(policy, theta, config.damping)
+    v, w = (cg(product, a, tol=0.0, maxiter=config.products)[0] for a in (g, b))
+    along, against, case = step_lengths(g @ v, g @ w, b @ w, excess, config.divergence)
+    direction = along * v - against * w
+
+    def attempt(carry):
+        count, *_ = carry
+        new = theta + config.shrink**count * direction
+        change, kl = surrogates(new), divergence(new)
+        # Danger may rise up to the limit, and not at all above it; reward may fall to get there.
+        fine = (kl <= config.divergence) & (change[DANGER] <= jnp.maximum(-excess, 0.0))
+        fine &= (change[REWARD] >= 0) | (excess > 0)
+        return count + 1, jnp.where(fine, new, theta), jnp.where(fine, kl, 0.0), fine
+
+    def going(carry):
+        count, *_, fine = carry
+        return ~fine & (count < config.backtracks)
+
+    begin = (jnp.asarray(0), theta, jnp.zeros_like(excess), jnp.asarray(False))
+    _, theta, kl, accepted = jax.lax.while_loop(going, attempt, begin)
+    return unravel(theta), Update(kl, case, accepted)
+
+
+def init(key: Array, pmdp: PMDP, config: CPOConfig) -> State:
+    """Starts all environments, a policy and a critic."""
+    return actor_critic.init(key, pmdp, config.rollout)
+
+
+def step(state: State, pmdp: PMDP, limit: Array, config: CPOConfig) -> tuple[State, Metrics]:
+    """Collects a batch, then improves policy and critic.
+
+    Args:
+        state: carried.
+        pmdp: the environment; without threats, as nothing is forbidden.
+        limit: () the greatest expected danger of an episode, not discounted; sweep it by `vmap`.
+        config: hyperparameters.
+    """
+    key, collect_key, fit_key = jax.random.split(state.key, 3)
+    state, batch, metrics = actor_critic.collect(collect_key, state, pmdp, config.rollout)
+    # The limit is of an episode; advantages are of a step, so both go by the step.
+    excess = (metrics.danger - limit * metrics.episodes) / metrics.steps
+    network = actor_critic.make_actor(pmdp, config.rollout)
+    actor, update = improve(state.actor, network, batch, excess, config)
+
+    def learn(state: State, part: Batch) -> State:
+        return actor_critic.update_critic(state, part, pmdp, config.rollout)
+
+    state = state._replace(actor=actor, key=key)
+    state = actor_critic.pass_over(fit_key, state, batch, learn, config.rollout)
+    return state, Metrics(metrics, update)

@@ -1,0 +1,133 @@
+"""PPO with a penalty that a PID controller adapts (Stooke et al. 2020)."""
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import linen as nn
+from jax import Array
+
+from rp_jax.baselines import actor_critic
+from rp_jax.baselines.actor_critic import DANGER, REWARD, ActorCriticConfig, Batch
+from rp_jax.planning.pmdp import PMDP
+from rp_jax.validate import number
+
+
+@dataclass(frozen=True)
+class PIDConfig:
+    """Hyperparameters of the learner."""
+
+    rollout: ActorCriticConfig = field(default_factory=ActorCriticConfig)
+    learning_rate: float = 3e-4  # of the policy
+    clip: float = 0.2  # of the probability ratio
+    proportional: float = 1.0
+    integral: float = 0.1
+    derivative: float = 1.0
+
+    def validate(self, name: str) -> None:
+        """Raises ValueError, naming the field after `name`, if a value is out of range."""
+        self.rollout.validate(f"{name}.rollout")
+        number(f"{name}.learning_rate", self.learning_rate, above=0)
+        number(f"{name}.clip", self.clip, above=0, most=1)
+        number(f"{name}.proportional", self.proportional, least=0)
+        number(f"{name}.integral", self.integral, least=0)
+        number(f"{name}.derivative", self.derivative, least=0)
+
+
+class Controller(NamedTuple):
+    """What the penalty remembers."""
+
+    integral: Array  # () sum of what was beyond the limit, never below 0
+    danger: Array  # () of an episode, as measured last
+
+
+class State(NamedTuple):
+    """Carried through learning."""
+
+    learner: actor_critic.State
+    actor_opt: optax.OptState
+    controller: Controller
+
+
+class Metrics(NamedTuple):
+    """Of one step."""
+
+    rollout: actor_critic.Metrics
+    penalty: Array  # () lambda
+
+
+def control(
+    controller: Controller, danger: Array, limit: Array, config: PIDConfig
+) -> tuple[Controller, Array]:
+    """The penalty lambda from the danger of the last episodes (Stooke et al., Algorithm 2)."""
+    error = danger - limit
+    integral = jnp.maximum(controller.integral + error, 0.0)
+    rise = jnp.maximum(danger - controller.danger, 0.0)
+    penalty = config.proportional * error + config.integral * integral + config.derivative * rise
+    return Controller(integral, danger), jnp.maximum(penalty, 0.0)
+
+
+def objective(
+    params: Any, network: nn.Module, batch: Batch, gain: Array, before: Array, clip: float
+) -> Array:
+    """() the clipped surrogate (Schulman et al. 2017, equation 7), to be maximised.
+
+    Args:
+        params: of the policy.
+        network: of the policy.
+        batch: (N,) steps.
+        gain: (N,) advantages, penalty included.
+        before: (N,) log probabilities under the policy that acted.
+        clip: how far the ratio may move the objective.
+    """
+    policy: Any = network.apply(params, batch.encoded)
+    ratio = jnp.exp(policy.log_prob(batch.action) - before)
+    return jnp.mean(jnp.minimum(ratio * gain, jnp.clip(ratio, 1 - clip, 1 + clip) * gain))
+
+
+def penalised(advantage: Array, penalty: Array) -> Array:
+    """(N,) (A_r - lambda A_d) / (1 + lambda) of advantages (N, 2).
+
+    Advantages are not standardised: the controller's gains are in units of scaled reward.
+    """
+    return (advantage[:, REWARD] - penalty * advantage[:, DANGER]) / (1 + penalty)
+
+
+def init(key: Array, pmdp: PMDP, config: PIDConfig) -> State:
+    """Starts all environments, a policy and a critic; the penalty is 0."""
+    learner = actor_critic.init(key, pmdp, config.rollout)
+    nothing = jnp.zeros_like(pmdp.x)
+    opt = optax.adam(config.learning_rate).init(learner.actor)
+    return State(learner, opt, Controller(nothing, nothing))
+
+
+def step(state: State, pmdp: PMDP, limit: Array, config: PIDConfig) -> tuple[State, Metrics]:
+    """Collects a batch, adapts the penalty, then improves policy and critic.
+
+    Arguments are those of `cpo.step`.
+    """
+    rollout = config.rollout
+    key, collect_key, fit_key = jax.random.split(state.learner.key, 3)
+    learner, batch, metrics = actor_critic.collect(collect_key, state.learner, pmdp, rollout)
+    # A batch in which no episode ended says nothing about them.
+    measured = metrics.danger / jnp.maximum(metrics.episodes, 1.0)
+    danger = jnp.where(metrics.episodes > 0, measured, state.controller.danger)
+    controller, penalty = control(state.controller, danger, limit, config)
+    network = actor_critic.make_actor(pmdp, rollout)
+    acted: Any = network.apply(learner.actor, batch.encoded)
+    items = (batch, penalised(batch.advantage, penalty), acted.log_prob(batch.action))
+    transform = optax.adam(config.learning_rate)
+
+    def update(carry, items):
+        learner, opt = carry
+        part, gain, before = items
+        grads = jax.grad(objective)(learner.actor, network, part, gain, before, config.clip)
+        changes, opt = transform.update(jax.tree.map(jnp.negative, grads), opt)
+        learner = learner._replace(actor=optax.apply_updates(learner.actor, changes))
+        return actor_critic.update_critic(learner, part, pmdp, rollout), opt
+
+    carry = (learner._replace(key=key), state.actor_opt)
+    learner, opt = actor_critic.pass_over(fit_key, carry, items, update, rollout)
+    return State(learner, opt, controller), Metrics(metrics, penalty)

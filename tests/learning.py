@@ -1,0 +1,28 @@
+"""What tests of on-policy learners share: sizes for tiny problems, and exact evaluation."""
+
+import finite
+import jax.numpy as jnp
+
+from rp_jax.baselines import actor_critic
+from rp_jax.baselines.actor_critic import ActorCriticConfig
+from rp_jax.tabular import threat
+
+ROLLOUT = ActorCriticConfig(
+    policy="categorical",
+    num_envs=64,
+    length=32,
+    gamma=1.0,
+    beta=1.0,
+    critic_rate=3e-3,
+    minibatches=4,
+    reward_scale=1.0,
+)
+
+
+def danger_and_return(model, pmdp, actor):
+    """Of a learned policy on a finite CMDP, exactly."""
+    network = actor_critic.make_actor(pmdp, ROLLOUT)
+    encoded = pmdp.perceive(finite.all_states(model)).encoded
+    policy = jnp.exp(network.apply(actor, encoded).log_probs).reshape(model.shape)
+    harm, gain = threat.threat(model, policy), threat.returns(model, policy)
+    return float(threat.expected(model, harm)), float(threat.expected(model, gain))
