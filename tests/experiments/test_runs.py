@@ -13,6 +13,7 @@ from tiny import programs_of_a_moment  # noqa: F401
 
 from experiments import certify, circuit, jam, pipeline, rare, runs
 from rp_jax import evaluate, storage
+from rp_jax.envs.tracks import circle_plan
 from rp_jax.planning import loop
 
 
@@ -151,7 +152,7 @@ def test_offspring_differ_from_their_parent_in_some_obstacles():
     assert (same ^ other).all()
     assert same.any()
     assert other.any()
-    alone = circuit.circuit.make_params(circuit.tracks.circle())
+    alone = circuit.circuit.make_params(circle_plan())
     first, second = (circuit.circuit.reset(jax.random.key(i), alone) for i in (0, 1))
     for share, wanted in ((0.0, first), (1.0, second)):
         jax.tree.map(
