@@ -88,7 +88,7 @@ class Seen(NamedTuple):
 
     encoded: Encoded  # (B,)
     threat: Array  # (B, A)
-    bits: Array  # (B,) int32, admissible actions
+    bits: Array  # (B, W) uint32, admissible actions
 
 
 class LoopState(NamedTuple):
