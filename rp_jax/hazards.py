@@ -90,6 +90,9 @@ def reach(agent: AgentModel, horizon: int) -> tuple[np.ndarray, np.ndarray]:
     turns = [np.abs(np.asarray(angle_of(agent.actions.rotation))).max()]
     turns.append(np.abs(np.asarray(angle_of(agent.baseline.rotations))).max())
     slow, fast = float(agent.speeds[0]), float(agent.speeds[-1])
+    if agent.room is not None:  # who slides along a wall goes aside at any heading, but no farther
+        far = np.full(2, horizon * max(-slow, fast))
+        return -far, far
     lower, upper = np.zeros(2), np.zeros(2)
     for k in range(horizon):
         # Largest change of heading before the k-th move.

@@ -113,7 +113,7 @@ def test_importing_the_core_loads_none_of_them():
 
 
 def test_the_command_lines_load_no_figures():
-    names = ["experiments.jam", "experiments.circuit"]
+    names = ["experiments.jam", "experiments.circuit", "experiments.point_gather"]
     assert run(f"import {', '.join(names)}, sys; print('matplotlib' in sys.modules)") == ["False"]
 
 

@@ -8,15 +8,23 @@ import numpy as np
 import pytest
 from quick import unoptimised
 
-from experiments import circuit, cli, jam, pipeline, tables
+from experiments import circuit, cli, jam, pipeline, point_gather, tables
 from rp_jax import storage
 from rp_jax.planning import loop
 from rp_jax.threat import artefact
 
-MODULES = {"circuit": circuit, "jam": jam}
+MODULES = {"circuit": circuit, "jam": jam, "point_gather": point_gather}
+KINDS = {"circuit": ["wall"], "jam": ["wall", "obstacle"], "point_gather": ["bomb"]}
 PROMISED = [
     *("env", "variant", "method", "seed", "episodes", "return_mean", "return_ci95"),
-    *("uncrashed_return_mean", "crashes", "crash_rate", "crash_upper95", "goal_rate"),
+    *(
+        "uncrashed_return_mean",
+        "crashes",
+        "crash_rate",
+        "crash_upper95",
+        "danger_mean",
+        "goal_rate",
+    ),
     *("interventions", "insecure", "seconds_per_100_actions", "train_seconds"),
 ]
 TINY_FIT = "--{0}.fit.steps 40 --{0}.fit.batch 64 --{0}.fit.hidden 16"
@@ -36,8 +44,7 @@ def programs_of_a_moment():
 
 def go(name, out, *options):
     module = MODULES[name]
-    kinds = ["wall", "obstacle"] if name == "jam" else ["wall"]
-    argv = " ".join([TINY, *(TINY_THREAT.format(kind) for kind in kinds), *options]).split()
+    argv = " ".join([TINY, *(TINY_THREAT.format(kind) for kind in KINDS[name]), *options]).split()
     argv += ["--out", str(out)]
     main = (f"experiments.{name}", module.__doc__, module.PRESETS, module.make_task, argv)
     assert cli.main(*main) == out
@@ -261,6 +268,26 @@ def test_a_run_of_jam_leaves_figures_and_an_animation(drawn):
     check_agents(drawn, "jam")
     rows = read(drawn / "threat" / "report.json")
     assert [row["hazard"] for row in rows] == ["obstacle", "wall"] * 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", ["tuned", "paper"])
+def test_a_run_of_point_gather_leaves_figures_and_an_animation(recipe, tmp_path):
+    folder = go("point_gather", tmp_path / recipe, f"--recipe {recipe} --test-bombs 8 --horizon 3")
+    names = ("learning_curves", "threat_fit", "trajectories", "threat_of_all", "threat_of_one_bomb")
+    for name in names:
+        assert (folder / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "animation.gif").read_bytes().startswith(b"GIF8")
+    check_table(folder, ["8 bombs"], [0, 1])
+    check_training(folder, 64, 8)
+
+
+def test_point_gather_has_no_plans():
+    config = point_gather.Config(baseline="plans")
+    with pytest.raises(ValueError, match=r"^baseline is 'plans'; it must be one of 'paper'"):
+        point_gather.make_task(config)
+    with pytest.raises(ValueError, match=r"^test_bombs is \(\)"):
+        point_gather.make_task(point_gather.Config(test_bombs=()))
 
 
 @pytest.mark.slow

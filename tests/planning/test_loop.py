@@ -206,7 +206,7 @@ def test_no_key_is_used_twice(monkeypatch):
 
     def act(key, state, *_):
         note(key)
-        return state, loop.Metrics(*[0.0] * 8)
+        return state, loop.Metrics(*[0.0] * 9)
 
     def learn(key, state, *_):
         note(key)
@@ -321,7 +321,9 @@ def test_inadmissible_actions_are_counted_if_there_are_any(compile_soon):
     pmdp, _, _ = learned("RP")
     state, _ = start(jax.random.key(7), pmdp, CONFIG)
     beside = jax.vmap(probe.start_at)(jnp.full(32, 5.0))
-    forged = jnp.full((32, 1), 1 << probe.RIGHT, jnp.uint32)  # a mask that lets all walk into the pit
+    forged = jnp.full(
+        (32, 1), 1 << probe.RIGHT, jnp.uint32
+    )  # a mask that lets all walk into the pit
     honest = jax.jit(loop._look)(pmdp, beside)
     seen = honest._replace(bits=forged)
     forced = state._replace(states=beside, seen=seen)

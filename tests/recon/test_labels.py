@@ -5,13 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rp_jax.envs import circuit, jam
+from rp_jax.envs import circuit, jam, point_gather
 from rp_jax.kinematics import independent_controls, make_vehicle
 from rp_jax.recon.labels import (
     Labels,
     best_estimator,
     exact_threat,
     label,
+    leaves,
     monte_carlo_threat,
     plan_threat,
 )
@@ -297,3 +298,22 @@ def test_plans_are_labelled_by_rollouts_of_plans():
     chosen = best_estimator(sub, 7)
     assert chosen.func is plan_threat
     assert chosen is best_estimator(sub, 7)
+
+
+def test_trees_are_enumerated_where_they_are_small_enough():
+    assert leaves(sub_of(circuit, "wall")) == 15 * 9**3
+    subs = {
+        h: point_gather.sub_rmdps(point_gather.make_params(horizon=h))["bomb"] for h in (1, 2, 15)
+    }
+    assert [leaves(subs[h]) for h in (1, 2)] == [81, 81**2]
+    assert best_estimator(subs[2], 10) is exact_threat
+    assert best_estimator(subs[15], 10).func is monte_carlo_threat
+
+
+def test_sampled_threats_of_a_bomb_agree_with_enumerated_ones():
+    sub = point_gather.sub_rmdps(point_gather.make_params(horizon=2))["bomb"]
+    agent, bomb = make_vehicle((5.0, 0.0), 0.3, 0.0), jnp.asarray([5.5, 1.6])
+    true = enumerate_all(jax.random.key(0), agent, bomb, sub).threat
+    found = simulate(jax.random.key(1), agent, bomb, sub, paths=2000)
+    assert ((true > 0.05) & (true < 0.9)).any()
+    assert (np.abs(found.threat - true) <= 5 * found.stderr + 1e-3).all()
