@@ -77,7 +77,8 @@ def trajectories(panels: Sequence[tuple[str, Scene, Sequence[Episode]]], path: P
         draw_scene(axis, scene)
         crashes = 0
         for episode in episodes:
-            axis.plot(*episode.position.T, color="#2b6cb0", alpha=0.6, linewidth=1)
+            dots = "." if len(episode.position) <= 20 else None  # where steps are long
+            axis.plot(*episode.position.T, marker=dots, color="#2b6cb0", alpha=0.6, linewidth=1)
             axis.annotate("S", episode.position[0], fontsize=8, ha="center", va="center")
             crashes += bool(episode.hit.any())
             axis.plot(*episode.position[episode.hit].T, "x", color=BAD, markersize=9, zorder=5)

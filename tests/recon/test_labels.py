@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rp_jax.envs import circuit, jam, point_gather
-from rp_jax.kinematics import independent_controls, make_vehicle
+from rp_jax.kinematics import AgentModel, advance, independent_controls, make_vehicle
 from rp_jax.recon.labels import (
     Labels,
     best_estimator,
@@ -39,10 +39,6 @@ def sub_of(env, kind):
 
 def with_source(sub, **changes):
     return sub.replace(source=sub.source.replace(**changes))
-
-
-def with_agent(sub, **changes):
-    return sub.replace(agent=sub.agent.replace(**changes))
 
 
 def of_cars(states):
@@ -104,6 +100,13 @@ def test_the_reported_error_is_that_of_the_estimate(cars):
     np.testing.assert_allclose(found.stderr[undecided], expected[undecided], rtol=0.15)
 
 
+class Driver(AgentModel):
+    """A vehicle of which the enumeration is not told that its controls act one step later."""
+
+    def step(self, vehicle, control):
+        return advance(vehicle, control, self.speeds)
+
+
 def test_skipping_the_last_control_of_a_delayed_agent_changes_nothing():
     sub = with_source(sub_of(jam, "wall"), horizon=3)
     rng = np.random.default_rng(0)
@@ -111,7 +114,8 @@ def test_skipping_the_last_control_of_a_delayed_agent_changes_nothing():
     agents, points = jax.vmap(sub.source.state_of)(jnp.asarray(states, float))
     key = jax.random.key(0)
     short = enumerate_each(key, agents, points, sub).threat
-    long = enumerate_each(key, agents, points, with_agent(sub, delayed=False)).threat
+    model = Driver(sub.agent.actions, sub.agent.baseline, sub.agent.speeds, delayed=False)
+    long = enumerate_each(key, agents, points, sub.replace(agent=model)).threat
     assert ((long > 0.01) & (long < 0.99)).sum() > 100
     np.testing.assert_allclose(short, long, atol=1e-6)
 
