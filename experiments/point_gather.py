@@ -133,7 +133,8 @@ def draw_maps(run: pipeline.Finished) -> None:
 
     def outline(axis, i: int) -> None:
         corners = np.asarray([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
-        axis.plot(*(centres[i] + point_gather.ROOM * corners).T, "w", scalex=False, scaley=False)
+        axis.autoscale(False)
+        axis.plot(*(centres[i] + point_gather.ROOM * corners).T, "w")
 
     maps.heat_maps(panels, run.config.x, run.folder / "threat_of_one_bomb.png", outline)
     key = pipeline.key_of(run.config.seed, pipeline.STARTS)

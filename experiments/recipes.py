@@ -22,6 +22,7 @@ TUNED_OBSTACLE = ThreatConfig(
 TUNED_BOMB = ThreatConfig(
     states=100_000,
     paths=32,
+    test_paths=1024,
     fit=FitConfig(hidden=(128, 128, 128), steps=10_000, batch=1024, learning_rate=3e-3),
 )
 
