@@ -42,14 +42,14 @@ def play(
     count = shown.alive.shape[1]
     empty = np.zeros((rows, count, 0, 2))
     others = obstacles(shown.states) if obstacles else None
-    crash = jax.jit(jax.vmap(run.task.env.causes, (0, None)))
+    over_episodes = jax.vmap(run.task.env.causes, (0, None))
+    causes = jax.jit(jax.vmap(over_episodes, (0, None)))(shown.states, params)
+    hit = np.any(list(causes.values()), axis=0)
     episodes = []
     for i in range(count):
         # The state after the last step stands in the row after it.
         end = min(int(shown.alive[:, i].sum()), steps) + 1
         at = lambda a, i=i, end=end: np.asarray(a)[:end, i]  # noqa: E731
-        last = jax.tree.map(lambda a, i=i, end=end: jnp.asarray(a[end - 1 : end, i]), shown.states)
-        hit = any(bool(v[0]) for v in crash(last, params).values())
         episodes.append(
             scenes.Episode(
                 position=at(shown.states.agent.position),
@@ -60,7 +60,7 @@ def play(
                 threat=at(shown.threat),
                 admissible=at(shown.admissible),
                 secure=at(shown.secure),
-                crashed=hit,
+                hit=at(hit),
             )
         )
     return episodes
@@ -149,4 +149,5 @@ def animation(run: Finished, scene: scenes.Scene, episode: scenes.Episode) -> No
         run.config.x,
         run.folder.parent / "animation.gif",
         lambda done, total: run.bar("animation", done, total),
+        "acceleration" if run.pmdp.params.agent.delayed else "step forward",
     )

@@ -41,9 +41,9 @@ class Config:
     out: Path | None = None  # folder for results; default: results/ENV-PRESET-TIME
     threat: Path | None = None  # folder of a threat function to use again
     x: float = 0.01  # largest admissible threat; inf switches the shield off
-    learning_penalty: float = 0.0  # taken off the reward per crash while learning
+    learning_penalty: float = 0.0  # taken off the reward per unit of danger while learning
     learning_toll: float = 0.0  # likewise, per state without an admissible action
-    penalty: float = 50.0  # taken off the return per crash in the tables
+    penalty: float = 50.0  # taken off the return per unit of danger in the tables
     episodes: int = 10_000  # evaluated per case
     figures: bool = True  # draw figures and an animation
     planning: LoopConfig = field(default_factory=LoopConfig)  # the learner
@@ -276,7 +276,7 @@ def _chunk_rows(
                 "method": method_name(config, member),
                 "steps": int(of["steps"]) + before[i],
                 "episodes": int(of["episodes"]),
-                "return_mean": (of["score"] - config.penalty * of["crashes"]) / ended
+                "return_mean": (of["score"] - config.penalty * of["danger"]) / ended
                 if of["episodes"]
                 else float("nan"),
                 "crashes": int(of["crashes"]),

@@ -1,5 +1,7 @@
 """Settings of the learner and the threat models that several tasks share."""
 
+import dataclasses
+
 from rp_jax.planning.dqn import DQNConfig
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.threat.build import ThreatConfig
@@ -16,6 +18,13 @@ TUNED_OBSTACLE = ThreatConfig(
     focus=1.0,
     prudence=0.05,
     fit=FitConfig(hidden=(128, 128, 128), steps=12_000, batch=1024, learning_rate=3e-3),
+)
+
+TUNED_BOMB = ThreatConfig(
+    states=100_000,
+    paths=32,
+    test_paths=1024,
+    fit=FitConfig(hidden=(128, 128, 128), steps=10_000, batch=1024, learning_rate=3e-3),
 )
 
 # Appendix G.1: 100,000 states and their mirror images, 20 and 25 epochs of batches of 512. The
@@ -45,6 +54,12 @@ PAPER_OBSTACLE = ThreatConfig(
         epsilon=1e-2,
         cosine=False,
     ),
+)
+# 1e6 trajectories, each shared by all first actions. Of its fit only the widths are published.
+PAPER_BOMB = ThreatConfig(
+    states=62_500,
+    paths=16,
+    fit=dataclasses.replace(PAPER_OBSTACLE.fit, hidden=(100, 100)),
 )
 PAPER_PLANNING = LoopConfig(
     network="paper",

@@ -12,14 +12,14 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from experiments import circuit, jam, pipeline
+from experiments import circuit, jam, pipeline, point_gather
 from rp_jax import storage
 from rp_jax.planning import loop
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.threat import artefact
 from rp_jax.validate import one_of
 
-EXPERIMENTS: dict[str, Any] = {"circuit": circuit, "jam": jam}
+EXPERIMENTS: dict[str, Any] = {"circuit": circuit, "jam": jam, "point_gather": point_gather}
 
 
 class Run(NamedTuple):

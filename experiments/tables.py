@@ -23,6 +23,7 @@ COLUMNS = [
     "crashes",
     "crash_rate",
     "crash_upper95",
+    "danger_mean",
     "goal_rate",
     "interventions",
     "insecure",

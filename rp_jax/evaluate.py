@@ -22,12 +22,12 @@ class Episodes(NamedTuple):
     """One row per episode."""
 
     score: Array  # reward, without penalty
-    danger: Array  # 1 for a crash
+    danger: Array  # 1 for a crash; may exceed 1 where an episode goes on after it
     goal: Array  # bool
     length: Array  # steps
     interventions: Array  # steps on which the mask changed the policy's own choice
     insecure: Array  # steps without an admissible action
-    causes: dict[str, Array]  # bool, what was being hit at the end
+    causes: dict[str, Array]  # bool, what was hit
 
 
 def greedy(network: nn.Module, weights: Any) -> Callable[[Percept], Array]:
@@ -102,7 +102,7 @@ def play_episodes(
                 length=rows.length + 1,
                 interventions=rows.interventions + changed,
                 insecure=rows.insecure + ~percept.secure,
-                causes=hit,
+                causes=jax.tree.map(jnp.logical_or, rows.causes, hit),
             )
             rows = jax.vmap(select)(alive, new, rows)
             return t + 1, alive & ~outcome.done, reached, rows
@@ -117,8 +117,9 @@ def play_episodes(
 def summarise(rows: Episodes, penalty: float) -> dict[str, Any]:
     """What is reported of some episodes; returns are over all of them, penalty included.
 
-    `crash_ci95` is the two-sided Clopper-Pearson interval of the crash rate, `crash_upper95` the
-    one-sided bound: what these episodes exclude.
+    A crash is an episode with any danger. `crash_ci95` is the two-sided Clopper-Pearson interval of
+    the crash rate, `crash_upper95` the one-sided bound: what these episodes exclude. `danger_mean`
+    is the danger of an episode, undiscounted, and `danger_ci95` its half-width.
 
     Args:
         rows: arrays (n,).
@@ -128,6 +129,7 @@ def summarise(rows: Episodes, penalty: float) -> dict[str, Any]:
     n, k = rows.score.size, int((rows.danger > 0).sum())
     returns = rows.score - penalty * rows.danger
     mean, width = statistics.mean_interval(np.asarray(returns))
+    danger, danger_width = statistics.mean_interval(np.asarray(rows.danger))
     steps = int(rows.length.sum())
     safe = rows.danger == 0
     low, high = statistics.clopper_pearson(k, n)
@@ -140,6 +142,8 @@ def summarise(rows: Episodes, penalty: float) -> dict[str, Any]:
         "crash_rate": k / n,
         "crash_ci95": [low, high],
         "crash_upper95": statistics.upper_bound(k, n),
+        "danger_mean": danger,
+        "danger_ci95": danger_width,
         "goal_rate": float(rows.goal.mean()),
         "interventions": float(rows.interventions.sum() / steps),
         "insecure": float(rows.insecure.sum() / steps),

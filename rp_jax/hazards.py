@@ -15,6 +15,7 @@ from rp_jax.kinematics import (
     advance,
     angle_of,
     make_vehicle,
+    rotate,
     squared_distance,
     to_ego,
 )
@@ -89,9 +90,13 @@ def reach(agent: AgentModel, horizon: int) -> tuple[np.ndarray, np.ndarray]:
     turns = [np.abs(np.asarray(angle_of(agent.actions.rotation))).max()]
     turns.append(np.abs(np.asarray(angle_of(agent.baseline.rotations))).max())
     slow, fast = float(agent.speeds[0]), float(agent.speeds[-1])
+    if agent.room is not None:  # who slides along a wall goes aside at any heading, but no farther
+        far = np.full(2, horizon * max(-slow, fast))
+        return -far, far
     lower, upper = np.zeros(2), np.zeros(2)
     for k in range(horizon):
-        swing = min(k * max(turns), np.pi)  # largest change of heading before the k-th move
+        # Largest change of heading before the k-th move.
+        swing = min((k if agent.delayed else k + 1) * max(turns), np.pi)
         upper[0] += max(fast, slow * np.cos(swing), 0.0)
         lower[0] += min(slow, fast * np.cos(swing), 0.0)
         side = max(abs(slow), fast) * np.sin(min(swing, np.pi / 2))
@@ -162,6 +167,70 @@ class WallPoint(struct.PyTreeNode):
     def state_of(self, features: Array) -> tuple[Vehicle, Array]:
         """See `HazardSource`."""
         return make_vehicle(jnp.zeros(2), 0.0, features[2]), features[:2]
+
+
+class Bomb(WallPoint):
+    """A fixed point that goes off when the agent's centre of mass comes nearer than `radius`.
+
+    The agent is held by the walls of a square room about the origin, so its way depends on where
+    in the room it is.
+    """
+
+    ahead: Array | float = 0.0  # () from the agent's position to its centre of mass, room units
+
+    @classmethod
+    def create(
+        cls, agent: AgentModel, radius: float = 1.0, horizon: int = 15, ahead: float = 0.0
+    ) -> "Bomb":
+        """With the window that `agent` can reach in `horizon` steps."""
+        return cls(
+            radius=jnp.asarray(radius, float),
+            window=_padded_window(agent, horizon, radius + ahead),
+            horizon=horizon,
+            ahead=jnp.asarray(ahead, float),
+        )
+
+    def centre(self, agent: Vehicle) -> Array:
+        """(2,) the agent's centre of mass."""
+        return agent.position + self.ahead * agent.heading
+
+    def hits(self, agent: Vehicle, hazard: Array) -> Array:
+        """Nearer than `radius` to the centre of mass."""
+        return squared_distance(hazard, self.centre(agent)) < jnp.square(self.radius)
+
+    def features(self, agent: Vehicle, hazard: Array) -> Array:
+        """(6,) in the agent's frame: its position (2), the room's centre (2); 4 x heading.
+
+        The room looks alike from its four sides, so four times the heading (cos, sin) says all.
+        """
+        relative = to_ego(hazard - agent.position, agent.heading)
+        centre = to_ego(-agent.position, agent.heading)
+        twice = rotate(agent.heading, agent.heading)
+        return jnp.concatenate([relative, centre, rotate(twice, twice)])
+
+    def mirrored(self, features: Array) -> Array:
+        """See `HazardSource`."""
+        signs = jnp.asarray([1.0, -1.0] * 3, features.dtype)
+        return features * jnp.broadcast_to(signs, features.shape)
+
+    def sample(self, key: Array, agent: AgentModel) -> tuple[Vehicle, Array]:
+        """See `HazardSource`. The agent may be anywhere in the room, as may the bomb in reach."""
+        assert agent.room is not None
+        place, turn, where = jax.random.split(key, 3)
+        room = jnp.full(2, agent.room)
+        position = jax.random.uniform(place, (2,), room.dtype, -room, room)
+        angle = jax.random.uniform(turn, (), float, -jnp.pi, jnp.pi)
+        far = jnp.max(jnp.maximum(-self.window.lower, self.window.upper))
+        low, high = jnp.maximum(-room, position - far), jnp.minimum(room, position + far)
+        hazard = jax.random.uniform(where, (2,), room.dtype, low, high)
+        return make_vehicle(position, angle, 0.0), hazard
+
+    def state_of(self, features: Array) -> tuple[Vehicle, Array]:
+        """See `HazardSource`. Of the four headings that look alike, the one nearest to 0."""
+        angle = angle_of(features[4:]) / 4
+        heading = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        agent = make_vehicle(-rotate(features[2:4], heading), angle, 0.0)
+        return agent, agent.position + rotate(features[:2], heading)
 
 
 class MovingObstacle(struct.PyTreeNode):

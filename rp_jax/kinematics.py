@@ -12,7 +12,7 @@ from jax import Array
 class Control(struct.PyTreeNode):
     """One command, or a table of commands along leading axes."""
 
-    acceleration: Array  # (...) room units / step^2
+    acceleration: Array  # (...) room units / step^2; of a point, its step forward
     rotation: Array  # (..., 2) (cos, sin) of the turn; turns to the left are positive
 
 
@@ -104,8 +104,9 @@ class AgentModel(struct.PyTreeNode):
     actions: Control  # (A,) table of discrete actions
     baseline: ControlDistribution | Plans  # eta^(o), functions of the agent alone (Theorem 3)
     speeds: Array  # (S,) the speeds reachable from rest, ascending; the ends are the limits
-    delayed: bool = struct.field(pytree_node=False, default=True)  # a control moves the agent
-    # only one step later, as in `advance`: exact enumeration may then skip the last control
+    room: Array | None = None  # () half the side of the square about the origin it cannot leave
+    delayed: bool = struct.field(pytree_node=False, default=True)  # see `advance`: where a control
+    # moves the agent only one step later, exact enumeration may skip the last one
 
     @property
     def num_threats(self) -> int:
@@ -137,7 +138,10 @@ class AgentModel(struct.PyTreeNode):
 
     def step(self, vehicle: Vehicle, control: Control) -> Vehicle:
         """The next state of the agent; unbatched in `vehicle` and `control`."""
-        return advance(vehicle, control, self.speeds)
+        moved = advance(vehicle, control, self.speeds, self.delayed)
+        if self.room is None:
+            return moved
+        return moved.replace(position=jnp.clip(moved.position, -self.room, self.room))
 
 
 def make_vehicle(position, heading, speed) -> Vehicle:
@@ -236,16 +240,24 @@ def angle_of(vector: Array) -> Array:
     return jnp.arctan2(vector[..., 1], vector[..., 0])
 
 
-def advance(vehicle: Vehicle, control: Control, speeds: Array) -> Vehicle:
+def advance(vehicle: Vehicle, control: Control, speeds: Array, delayed: bool = True) -> Vehicle:
     """One step: move along the old heading at the old speed, then change speed and heading.
 
     Args:
         vehicle: the state before; unbatched or with leading axes that broadcast.
         control: the command.
         speeds: (S,) ascending; the new speed is clipped to its ends.
+        delayed: false for a point without inertia, which changes first, then moves at the new
+            speed along the new heading, and stands still again.
     """
-    return Vehicle(
-        position=vehicle.position + vehicle.heading * vehicle.speed[..., None],
+    changed = Vehicle(
+        position=vehicle.position,
         heading=rotate(vehicle.heading, control.rotation),
         speed=jnp.clip(vehicle.speed + control.acceleration, speeds[0], speeds[-1]),
+    )
+    moving = vehicle if delayed else changed
+    return Vehicle(
+        position=vehicle.position + moving.heading * moving.speed[..., None],
+        heading=changed.heading,
+        speed=changed.speed if delayed else jnp.zeros_like(changed.speed),
     )

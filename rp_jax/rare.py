@@ -29,7 +29,7 @@ class Paths(NamedTuple):
     states: Any  # where they are
     starts: Any  # where they began
     highest: Array  # (B,) greatest least threat on the way so far
-    crashed: Array  # (B,) bool; the episode has ended
+    crashed: Array  # (B,) bool; there the path ends, even if the episode would go on
     reached: Array  # (B,) bool, the level of the last stage was reached, or the episode crashed
     length: Array  # (B,) int32, steps simulated in the last stage
 
@@ -80,7 +80,7 @@ def advance(key: Array, paths: Paths, pmdp: PMDP, values: Values, level: Array) 
             reached=paths.reached | there | crashed,
             length=paths.length + alive,
         )
-        return t + 1, alive & ~outcome.done, paths
+        return t + 1, alive & ~outcome.done & ~crashed, paths
 
     blank = paths._replace(reached=paths.crashed, length=jnp.zeros(count, jnp.int32))
     carry = (jnp.asarray(0), ~paths.crashed, blank)

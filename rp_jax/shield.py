@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+WORD = 32  # actions to a word of a stored mask
+
 
 class Shield(NamedTuple):
     """What a state allows."""
@@ -126,18 +128,19 @@ def masked_sample(key: Array, admissible: Array) -> Array:
 
 
 def to_bits(admissible: Array) -> Array:
-    """() int32, the mask (A,) as one integer, for storage.
-
-    Raises:
-        ValueError: there are more than 31 actions.
-    """
+    """(W,) uint32, the mask (A,) as words of 32 actions, for storage."""
     chex.assert_rank(admissible, 1)
-    if admissible.shape[0] > 31:
-        raise ValueError(f"admissible has {admissible.shape[0]} actions; it must have at most 31")
-    bits = jnp.where(admissible, 1 << jnp.arange(admissible.shape[0]), 0)
-    return jnp.sum(bits, dtype=jnp.int32)
+    parts = jnp.split(admissible, list(range(WORD, len(admissible), WORD)))
+    bits = [part.astype(jnp.uint32) << _places(len(part)) for part in parts]
+    return jnp.stack([jnp.sum(word, dtype=jnp.uint32) for word in bits])
 
 
 def from_bits(bits: Array, num_actions: int) -> Array:
     """(A,) bool, the inverse of `to_bits`."""
-    return ((bits >> jnp.arange(num_actions)) & 1).astype(bool)
+    chex.assert_rank(bits, 1)
+    each = (bits[:, None] >> _places(WORD)[None]) & 1
+    return each.astype(bool).reshape(-1)[:num_actions]
+
+
+def _places(count: int) -> Array:
+    return jnp.arange(count, dtype=jnp.uint32)

@@ -143,7 +143,7 @@ def test_without_its_library_an_adapter_says_what_to_install(adapter, advice):
 
 
 def test_the_command_lines_load_no_figures():
-    names = ["experiments.jam", "experiments.circuit"]
+    names = ["experiments.jam", "experiments.circuit", "experiments.point_gather"]
     assert run(f"import {', '.join(names)}, sys; print('matplotlib' in sys.modules)") == ["False"]
 
 

@@ -193,6 +193,16 @@ def test_a_summary_without_crashes_says_what_is_excluded():
     assert found["return_ci95"] == 0
 
 
+def test_an_episode_of_several_bombs_is_one_crash_and_more_danger():
+    rows = made([20, 10, 0, 0], [3, 0, 1, 0], [0] * 4, [15] * 4, [0] * 4, [0] * 4, [1, 0, 1, 0])
+    found = evaluate.summarise(rows, 2.0)
+    assert found["crashes"] == 2
+    assert found["danger_mean"] == 1.0
+    assert found["return_mean"] == (14 + 10 - 2) / 4
+    assert found["danger_ci95"] == pytest.approx(stats.t.ppf(0.975, 3) * np.sqrt(2) / 2)
+    assert found["causes"]["pit"] == 2
+
+
 def test_a_summary_of_crashes_alone_or_of_one_episode():
     all_crashed = made([1, 2], [1, 1], [0, 0], [5, 5], [0, 0], [0, 0], [1, 1])
     found = evaluate.summarise(all_crashed, 10.0)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from rp_jax.envs import circuit, jam
+from rp_jax.envs import circuit, jam, point_gather
 from rp_jax.kinematics import (
     Control,
     ControlDistribution,
@@ -195,7 +195,7 @@ def test_plans_are_all_turns_at_all_targets_braking_first():
     assert PLANS.horizon == 1 + 3 + 5 + 1
 
 
-@pytest.mark.parametrize("task", [circuit, jam])
+@pytest.mark.parametrize("task", [circuit, jam, point_gather])
 def test_a_continuous_action_says_what_the_table_says_at_its_rows(task):
     agent = task.make_params().agent
     strongest = max(task.ACCELERATIONS), max(task.TURNS)
@@ -241,3 +241,27 @@ def test_mirrored_threats_are_refused_where_a_plan_has_no_mirror_image():
     lopsided = make_plans((0.0, 0.3), (), 0, 0.02, 0.1)
     with pytest.raises(ValueError, match="baseline: there is no mirror image"):
         mirrored_threats(agent.replace(baseline=lopsided))
+
+
+def test_a_point_changes_first_then_moves_and_stands_still_again():
+    control = Control(acceleration=jnp.asarray(0.5), rotation=jnp.asarray([0.0, 1.0]))
+    vehicle = make_vehicle((1.0, 2.0), 0.0, 0.0)
+    speeds = jnp.asarray([-1.0, 1.0])
+    point = advance(vehicle, control, speeds, delayed=False)
+    np.testing.assert_allclose(point.position, [1.0, 2.5], atol=1e-6)
+    np.testing.assert_allclose(point.heading, [0.0, 1.0], atol=1e-6)
+    assert point.speed == 0
+    car = advance(vehicle, control, speeds)
+    np.testing.assert_allclose(car.position, [1.0, 2.0])
+    assert car.speed == 0.5
+    strongest = control.replace(acceleration=jnp.asarray(3.0))
+    np.testing.assert_allclose(advance(vehicle, strongest, speeds, False).position, [1.0, 3.0])
+
+
+def test_a_room_holds_its_agent_and_no_other():
+    agent = point_gather.make_params().agent
+    control = Control(acceleration=jnp.asarray(1.0), rotation=jnp.asarray([1.0, 0.0]))
+    vehicle = make_vehicle((5.5, -5.9), -np.pi / 4, 0.0)
+    np.testing.assert_allclose(agent.step(vehicle, control).position, [6.0, -6.0])
+    free = agent.replace(room=None).step(vehicle, control)
+    assert free.position[0] > 6 > -6 > free.position[1]

@@ -2,11 +2,11 @@
 
 from typing import Any
 
-from rp_jax.envs import circuit, jam
+from rp_jax.envs import circuit, jam, point_gather
 from rp_jax.envs.base import Env
 from rp_jax.validate import one_of
 
-ENVS: dict[str, Any] = {"circuit": circuit, "jam": jam}
+ENVS: dict[str, Any] = {"circuit": circuit, "jam": jam, "point_gather": point_gather}
 
 
 def make(name: str, **settings: Any) -> tuple[Env, Any]:

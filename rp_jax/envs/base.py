@@ -85,6 +85,18 @@ def select(condition: Array, yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
+def ranks(values: Array) -> Array:
+    """(n,) how many of `values` (n,) stand before each in ascending order; equals as they come.
+
+    Counting is faster than a sort for short lists.
+    """
+    count = jnp.arange(len(values))
+    ahead = (values[None, :] < values[:, None]) | (
+        (values[None, :] == values[:, None]) & (count[None, :] < count[:, None])
+    )
+    return jnp.sum(ahead, axis=-1)
+
+
 def renew(where: Array, rows: Any, make: Callable[[Array], Any], chunk: int = 16) -> Any:
     """Replaces the rows of a batch that are marked, computing only those.
 

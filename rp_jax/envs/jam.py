@@ -329,13 +329,8 @@ def _seen_obstacles(state: State) -> Array:
     turn = angle_of(to_ego(facing, agent.heading))
     rows = jnp.concatenate([local, turn[:, None], speed[:, None]], axis=-1)
     squared = jnp.sum(jnp.square(offset), axis=-1)
-    # The rank by counting is faster than a sort for such short lists.
-    count = jnp.arange(len(squared))
-    ahead = (squared[None, :] < squared[:, None]) | (
-        (squared[None, :] == squared[:, None]) & (count[None, :] < count[:, None])
-    )
-    rank = jnp.sum(ahead, axis=-1)
-    return jnp.zeros((SEEN_OBSTACLES, 4), rows.dtype).at[rank].set(rows, mode="drop")
+    nearest = base.ranks(squared)
+    return jnp.zeros((SEEN_OBSTACLES, 4), rows.dtype).at[nearest].set(rows, mode="drop")
 
 
 def observe(state: State, params: Params) -> Array:

@@ -23,7 +23,7 @@ class Transition(NamedTuple):
     reward: Array  # () discounted sum over the n steps
     discount: Array  # () gamma^n, 0 after a true end
     next_encoded: Encoded
-    next_admissible: Array  # () int32, `shield.to_bits`
+    next_admissible: Array  # (W,) uint32, `shield.to_bits`
 
 
 @dataclass(frozen=True)

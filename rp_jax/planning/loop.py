@@ -76,7 +76,8 @@ class Metrics(NamedTuple):
     steps: Array
     episodes: Array
     score: Array  # of the finished episodes, without penalty
-    crashes: Array
+    danger: Array  # of the finished episodes
+    crashes: Array  # finished episodes with any danger
     goals: Array
     insecure: Array  # states without an admissible action
     inadmissible: Array  # actions taken whose threat exceeds x though others' did not
@@ -88,7 +89,7 @@ class Seen(NamedTuple):
 
     encoded: Encoded  # (B,)
     threat: Array  # (B, A)
-    bits: Array  # (B,) int32, admissible actions
+    bits: Array  # (B, W) uint32, admissible actions
 
 
 class LoopState(NamedTuple):
@@ -97,6 +98,7 @@ class LoopState(NamedTuple):
     states: Any  # (B,) environment states
     seen: Seen  # of those states
     score: Array  # (B,) reward of the running episodes
+    danger: Array  # (B,) likewise
     window: Taken  # (n_step, B), oldest first
     learner: Learner
     replay: Any
@@ -180,12 +182,13 @@ def interact(
         next_encoded=seen.encoded,
         next_admissible=seen.bits,
     )
-    score = state.score + outcome.reward
+    score, danger = state.score + outcome.reward, state.danger + outcome.danger
     metrics = Metrics(
         steps=jnp.asarray(batch, score.dtype),
         episodes=jnp.sum(outcome.done, dtype=score.dtype),
         score=jnp.sum(jnp.where(outcome.done, score, 0.0)),
-        crashes=jnp.sum(outcome.danger),
+        danger=jnp.sum(jnp.where(outcome.done, danger, 0.0)),
+        crashes=jnp.sum(outcome.done & (danger > 0), dtype=score.dtype),
         goals=jnp.sum(outcome.goal, dtype=score.dtype),
         insecure=jnp.sum(jnp.min(state.seen.threat, axis=-1) > pmdp.x, dtype=score.dtype),
         inadmissible=jnp.sum(_inadmissible(state.seen.threat, action, pmdp.x), dtype=score.dtype),
@@ -198,6 +201,7 @@ def interact(
         states=carried[0],
         seen=carried[1],
         score=jnp.where(outcome.done, 0.0, score),
+        danger=jnp.where(outcome.done, 0.0, danger),
         window=window,
     )
     return state, metrics
@@ -228,6 +232,7 @@ def init(key: Array, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics
         states=states,
         seen=seen,
         score=zeros,
+        danger=zeros,
         window=window,
         learner=dqn.init(net_key, network, make_optimiser(config), encoded),
         replay=replay.init(jax.tree.map(lambda a: a[0], example)),

@@ -32,7 +32,7 @@ class TunedNetwork(nn.Module):
 
 class PaperNetwork(nn.Module):
     """Appendix G.1: convolution (3 channels, kernel 6) and max pooling (8) of the LIDAR, then
-    50-20 tanh units."""
+    50-20 tanh units; without a LIDAR 50-50."""
 
     num_actions: int
     scale: tuple[float, ...]  # not used: the paper feeds raw values
@@ -40,15 +40,17 @@ class PaperNetwork(nn.Module):
     @nn.compact
     def __call__(self, seen: Encoded) -> Array:
         """(..., A) action values."""
-        scan = seen.scan.astype(seen.rest.dtype) / 255
-        scan = jnp.where(scan == 1.0, 0.0, scan)  # the paper's scans say 0 where nothing is seen
-        x = _convolve_and_pool(
-            scan,
-            self.param("kernel", nn.initializers.lecun_normal(), (6, 3)),
-            self.param("bias", nn.initializers.zeros, (3,)),
-        )
-        x = jnp.concatenate([x, seen.rest], axis=-1)
-        for width in (50, 20):
+        x, lidar = seen.rest, seen.scan.shape[-1] > 0
+        if lidar:
+            scan = seen.scan.astype(x.dtype) / 255
+            scan = jnp.where(scan == 1.0, 0.0, scan)  # the paper's scans say 0 for nothing seen
+            pooled = _convolve_and_pool(
+                scan,
+                self.param("kernel", nn.initializers.lecun_normal(), (6, 3)),
+                self.param("bias", nn.initializers.zeros, (3,)),
+            )
+            x = jnp.concatenate([pooled, x], axis=-1)
+        for width in (50, 20) if lidar else (50, 50):
             x = nn.tanh(nn.Dense(width)(x))
         return nn.Dense(self.num_actions)(x)
 

@@ -19,7 +19,7 @@ class Taken(NamedTuple):
     terminated: Array  # (B,)
     done: Array  # (B,)
     next_encoded: Encoded
-    next_admissible: Array  # (B,) bits
+    next_admissible: Array  # (B, W) bits
 
 
 def n_step_transition(window: Taken, gamma: float) -> Transition:

@@ -14,6 +14,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 AGENT, OBSTACLE, ZONE = "#d69e2e", "#63b3ed", "#c6f6d5"
+GOOD, BAD = "#38a169", "#c53030"
 
 
 class Scene(NamedTuple):
@@ -24,6 +25,8 @@ class Scene(NamedTuple):
     zone: float = 0.0  # side of the zones' squares, or their radius
     round_zones: bool = False
     radius: float = 0.1  # of the vehicles
+    colours: Sequence[str] = ()  # of the obstacles, where they differ
+    rings: Sequence[tuple[np.ndarray, float, str]] = ()  # places (n, 2), radius and colour
 
 
 class Episode(NamedTuple):
@@ -37,11 +40,11 @@ class Episode(NamedTuple):
     threat: np.ndarray  # (t, A)
     admissible: np.ndarray  # (t, A)
     secure: np.ndarray  # (t,)
-    crashed: bool
+    hit: np.ndarray  # (t,) bool, danger was met on the way here
 
 
 def draw_scene(axis: Any, scene: Scene) -> None:
-    """Walls as dots, safety zones shaded."""
+    """Walls as dots, safety zones shaded, rings about their places."""
     low, high = scene.walls.min(axis=0), scene.walls.max(axis=0)
     for corner in scene.corners:
         if scene.round_zones:
@@ -52,6 +55,10 @@ def draw_scene(axis: Any, scene: Scene) -> None:
             place = np.minimum(corner, high - scene.zone)
             axis.add_patch(Rectangle(place, scene.zone, scene.zone, color=ZONE, zorder=0))
     axis.plot(*scene.walls.T, ".", color="#2d3748", markersize=1.5, zorder=1)
+    for places, radius, colour in scene.rings:
+        for place in places:
+            axis.add_patch(Circle(tuple(place), radius, fill=False, edgecolor=colour, zorder=1))
+            axis.plot(*place, "o", color=colour, markersize=3, zorder=1)
     axis.set_aspect("equal")
     axis.set_xticks([])
     axis.set_yticks([])
@@ -59,18 +66,22 @@ def draw_scene(axis: Any, scene: Scene) -> None:
 
 def trajectories(panels: Sequence[tuple[str, Scene, Sequence[Episode]]], path: Path) -> None:
     """Paths of several episodes per panel (figure 6); S marks the start, red crosses crashes."""
+    columns = min(3, len(panels))
+    lines = -(-len(panels) // columns)
     figure, axes = plt.subplots(
-        1, len(panels), figsize=(5 * len(panels), 4.6), layout="constrained", squeeze=False
+        lines, columns, figsize=(5 * columns, 4.6 * lines), layout="constrained", squeeze=False
     )
-    for axis, (title, scene, episodes) in zip(axes[0], panels, strict=True):
+    for axis in axes.flat[len(panels) :]:
+        axis.axis("off")
+    for axis, (title, scene, episodes) in zip(axes.flat, panels, strict=False):
         draw_scene(axis, scene)
         crashes = 0
         for episode in episodes:
-            axis.plot(*episode.position.T, color="#2b6cb0", alpha=0.6, linewidth=1)
+            dots = "." if len(episode.position) <= 20 else None  # where steps are long
+            axis.plot(*episode.position.T, marker=dots, color="#2b6cb0", alpha=0.6, linewidth=1)
             axis.annotate("S", episode.position[0], fontsize=8, ha="center", va="center")
-            if episode.crashed:
-                crashes += 1
-                axis.plot(*episode.position[-1], "x", color="#c53030", markersize=9, zorder=5)
+            crashes += bool(episode.hit.any())
+            axis.plot(*episode.position[episode.hit].T, "x", color=BAD, markersize=9, zorder=5)
         axis.set_title(f"{title}: {crashes} of {len(episodes)} episodes crashed", fontsize=10)
     figure.savefig(path, dpi=120)
     plt.close(figure)
@@ -84,6 +95,7 @@ def animate(
     x: float,
     path: Path,
     on_progress: Callable[[int, int], None] | None = None,
+    rows: str = "acceleration",
 ) -> None:
     """An animated GIF: the world on the left, the threat of each action on the right.
 
@@ -97,6 +109,7 @@ def animate(
         x: the threshold.
         path: of the GIF.
         on_progress: called with (frames done, frames).
+        rows: what the rows of the table are.
     """
     frames = len(episode.action)
     shape = (len(accelerations), len(turns))
@@ -106,8 +119,8 @@ def animate(
     draw_scene(world, scene)
     (trail,) = world.plot([], [], color=AGENT, linewidth=1)
     others = [
-        world.add_patch(Circle((0, 0), scene.radius, color=OBSTACLE))
-        for _ in range(episode.obstacles.shape[1])
+        world.add_patch(Circle((0, 0), scene.radius, color=colour))
+        for colour in scene.colours or [OBSTACLE] * episode.obstacles.shape[1]
     ]
     agent = world.add_patch(Circle((0, 0), scene.radius, color=AGENT, zorder=4))
     noses = [
@@ -116,9 +129,10 @@ def animate(
     # The leftmost turn stands leftmost, as seen by the driver.
     image = table.imshow(np.ones(shape), norm=LogNorm(1e-4, 1, clip=True), cmap="inferno")
     table.set_xticks(range(shape[1]), [f"{t:+.2f}" for t in turns[::-1]])
+    table.tick_params(axis="x", labelrotation=0 if shape[1] <= 5 else 60)
     table.set_yticks(range(shape[0]), [f"{a:+.2f}" for a in accelerations])
     table.set_xlabel("turn, radians (left is positive)")
-    table.set_ylabel("acceleration")
+    table.set_ylabel(rows)
     figure.colorbar(image, ax=table, label="threat", shrink=0.7)
     crosses = [
         [table.text(j, i, "", ha="center", va="center", color="white") for j in range(shape[1])]
@@ -146,10 +160,10 @@ def animate(
         frame.set_xy((shape[1] - 1 - column - 0.5, row - 0.5))
         state = "" if episode.secure[t] else "; none is below: the least"
         table.set_title(f"crossed: threat above {x:g}{state}", fontsize=10)
-        world.set_title(f"step {t}" + (", CRASH" if episode.crashed and t == frames - 1 else ""))
+        world.set_title(f"step {t}" + (", CRASH" if episode.hit[t] else ""))
         if on_progress:
             on_progress(t + 1, frames)
 
     animation = FuncAnimation(figure, show, frames=frames, init_func=lambda: None)
-    animation.save(path, writer=PillowWriter(fps=12), dpi=80)
+    animation.save(path, writer=PillowWriter(fps=12 if frames > 20 else 3), dpi=80)
     plt.close(figure)

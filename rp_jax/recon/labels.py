@@ -25,6 +25,8 @@ class Labels(struct.PyTreeNode):
     stderr: Array  # alike, 0 where exact, and where all sampled paths agree
 
 
+MOST_LEAVES = 200_000  # of a tree that is enumerated
+
 # (key, agent, hazard, sub) -> Labels, unbatched.
 Estimator = Callable[[Array, Any, Any, SubRMDP], Labels]
 
@@ -32,8 +34,7 @@ Estimator = Callable[[Array, Any, Any, SubRMDP], Labels]
 def exact_threat(key: Array, agent: Any, hazard: Any, sub: SubRMDP) -> Labels:
     """Enumerates all baseline controls; exact for hazards that stay where they are.
 
-    A tree of A * K^(horizon - 2) leaves for an agent whose controls act one step later (K
-    baseline controls), of A * K^(horizon - 1) otherwise. `key` is not used.
+    The tree has `leaves(sub)` leaves. `key` is not used.
     """
     del key
     source, model = sub.source, sub.agent
@@ -141,11 +142,26 @@ def _average(values: Array) -> Labels:
     return Labels(threat=jnp.mean(values, axis=0), stderr=spread / jnp.sqrt(paths))
 
 
+def leaves(sub: SubRMDP) -> int:
+    """Size of the tree that `exact_threat` enumerates.
+
+    A * K^(horizon - 1) for A actions and K baseline controls, and a power less where controls act
+    one step later.
+    """
+    assert isinstance(sub.agent.baseline, ControlDistribution)
+    controls = len(sub.agent.baseline.probabilities)
+    power = max(0, sub.source.horizon - 1 - sub.agent.delayed)
+    return len(sub.agent.actions.acceleration) * controls**power
+
+
 def best_estimator(sub: SubRMDP, paths: int) -> Estimator:
-    """Exact enumeration where the hazard stays put, Monte Carlo with `paths` rollouts elsewhere."""
+    """Exact enumeration where the hazard stays put and the tree is small enough.
+
+    Elsewhere Monte Carlo with `paths` rollouts.
+    """
     if isinstance(sub.agent.baseline, Plans):
         return _sampled(plan_threat, paths)
-    if sub.source.static:
+    if sub.source.static and leaves(sub) <= MOST_LEAVES:
         return exact_threat
     return _sampled(monte_carlo_threat, paths)
 

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from rp_jax.envs import circuit, jam
+from rp_jax.envs import circuit, jam, point_gather
 from rp_jax.kinematics import Control, Vehicle
 
 BINS = 360
@@ -16,7 +16,13 @@ VALUES = {"float64": 1e-9, "float32": 1e-5}  # tolerance of states and rewards
 SEEN = {"float64": 1e-6, "float32": 1e-5}  # of observations, which are recorded in float32
 TIE = {"float64": 1e-9, "float32": 1e-5}  # radians from a bin's edge, units from other limits
 JAMS = {"traces_jam": 8, "traces_jam_n3": 3, "traces_jam_n15": 15}
-ROWS = {"traces_circuit": 1202, "traces_jam": 1358, "traces_jam_n3": 188, "traces_jam_n15": 190}
+ROWS = {
+    "traces_circuit": 1202,
+    "traces_jam": 1358,
+    "traces_jam_n3": 188,
+    "traces_jam_n15": 190,
+    "traces_gather": 1366,
+}
 
 # LIDAR bins, of 360 a row, left out before and after the step.
 TIED_BINS = {
@@ -33,6 +39,8 @@ TIED_BINS = {
 HALF_TURNS = {"traces_jam": (0, 0), "traces_jam_n3": (940, 940), "traces_jam_n15": (0, 0)}
 # Rows whose two nearest centre points are equally far.
 TIED_INDICES = {"float64": 0, "float32": 19}
+# Sensor bins, of 20 a row, left out before and after the step.
+TIED_SENSORS = {"float64": (0, 0), "float32": (0, 0)}
 
 
 def real(values):
@@ -207,3 +215,90 @@ def test_jam_replays_every_recorded_transition(golden, precision, name):
         same(observed[:, others], expected[:, others], SEEN[precision])
         turns = same_angles(observed[:, angles], expected[:, angles], SEEN[precision])
         assert turns == HALF_TURNS[name][part]
+
+
+def objects(data, kind, count, suffix=""):
+    """The recorded lists of objects, those of one kind first; padded, at (77, 77), to `count`."""
+    listed = data[f"objects{suffix}"]
+    mine = listed[..., 2] == kind
+    rows = np.argsort(~mine, axis=1, kind="stable")[:, :count]
+    present = np.take_along_axis(mine, rows, axis=1)
+    places = np.take_along_axis(listed[..., :2], rows[..., None], axis=1)
+    return point_gather.Objects(real(np.where(present[..., None], places, 77.0)), present)
+
+
+def gatherers(data, suffix=""):
+    """Recorded states of Point Gather; some have three apples."""
+    pose, count = data[f"qpos{suffix}"], len(data["t"])
+    return point_gather.State(
+        agent=Vehicle(
+            position=real(pose[:, :2]),
+            heading=real(np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1)),
+            speed=real(np.zeros(count)),
+        ),
+        angle=real(pose[:, 2]),
+        velocity=real(data[f"qvel{suffix}"]),
+        apples=objects(data, 0, 3, suffix),
+        bombs=objects(data, 1, 8, suffix),
+        hit=np.zeros(count, bool),
+        time=np.zeros(count, np.int32),
+    )
+
+
+def tied_sensors(data, suffix, tolerance):
+    """(rows, 20) bins with an object near one of their edges, or near the limit of view."""
+    offset = data[f"objects{suffix}"][..., :2] - data[f"com{suffix}"][:, None, :2]
+    distance = np.hypot(*np.moveaxis(offset, -1, 0))
+    angle = np.arctan2(offset[..., 1], offset[..., 0]) - data[f"qpos{suffix}"][:, 2:]
+    place = ((angle + np.pi) % (2 * np.pi) - np.pi / 2) / (np.pi / 10)
+    edge = np.round(place)
+    aside = np.abs(place - edge) * (np.pi / 10)
+    near = (aside < tolerance) & (distance < 6 + tolerance) & (edge >= 0) & (edge <= 10)
+    near |= (np.abs(distance - 6) < tolerance) & (place > -0.01) & (place < 10.01)
+    tied = np.zeros((len(offset), 20), bool)
+    for row, item in np.argwhere(near):
+        first = 10 * int(data[f"objects{suffix}"][row, item, 2])
+        for index in {int(edge[row, item]) - 1, int(edge[row, item]), int(place[row, item])}:
+            if 0 <= index < 10:
+                tied[row, first + index] = True
+    return tied
+
+
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+def test_point_gather_replays_every_recorded_transition(golden, precision, kind):
+    data = golden("traces_gather")
+    tolerance, tie = VALUES[precision], TIE[precision]
+    params = point_gather.make_params(3, 8)
+    states, expected = gatherers(data), gatherers(data, "_next")
+    if kind == "discrete":
+        actions = data["action81"].astype(np.int32)
+    else:
+        actions = real(data["action"] / [1.0, 0.25])
+    step = jax.jit(jax.vmap(point_gather.step, (None, 0, 0, None)))
+    reached, outcome = step(jax.random.key(0), states, actions, params)
+
+    # No object is near the limit of reach, so no row is left out.
+    place = data["com_next"][:, None, :2]
+    assert ties(np.linalg.norm(data["objects"][..., :2] - place, axis=-1), 1.0, 1e-5) == 0
+    same(reached.agent.position, expected.agent.position, tolerance)
+    same(reached.agent.heading, expected.agent.heading, tolerance)
+    same(reached.angle, expected.angle, tolerance)
+    same(reached.velocity, expected.velocity, tolerance)
+    for kind in ("apples", "bombs"):
+        found, wanted = getattr(reached, kind), getattr(expected, kind)
+        assert found.present.sum() == wanted.present.sum()
+        for row in range(len(found.present)):
+            left = np.asarray(found.position)[row, np.asarray(found.present)[row]]
+            same(left, wanted.position[row, wanted.present[row]], tolerance)
+    same(outcome.reward - outcome.danger, data["reward"], tolerance)
+    np.testing.assert_array_equal(outcome.terminated, data["done"])
+    assert not (outcome.truncated | outcome.goal).any()
+    assert {0, 1, 2} == set(np.asarray(outcome.danger).tolist())
+
+    observe = jax.jit(jax.vmap(point_gather.observe, (0, None)))
+    for part, (state, suffix) in enumerate([(states, ""), (reached, "_next")]):
+        observed, recorded = np.array(observe(state, params)), data[f"obs{suffix}"].copy()
+        tied = tied_sensors(data, suffix, tie)
+        assert tied.sum() == TIED_SENSORS[precision][part]
+        observed[:, 9:][tied] = recorded[:, 9:][tied] = 0.0
+        same(observed, recorded, tolerance)

@@ -8,14 +8,21 @@ import numpy as np
 import pytest
 from tiny import MODULES, go, programs_of_a_moment  # noqa: F401
 
-from experiments import circuit, pipeline, tables
+from experiments import circuit, pipeline, point_gather, tables
 from rp_jax import storage
 from rp_jax.planning import loop
 from rp_jax.threat import artefact
 
 PROMISED = [
     *("env", "variant", "method", "seed", "episodes", "return_mean", "return_ci95"),
-    *("uncrashed_return_mean", "crashes", "crash_rate", "crash_upper95", "goal_rate"),
+    *(
+        "uncrashed_return_mean",
+        "crashes",
+        "crash_rate",
+        "crash_upper95",
+        "danger_mean",
+        "goal_rate",
+    ),
     *("interventions", "insecure", "seconds_per_100_actions", "train_seconds"),
 ]
 
@@ -223,6 +230,26 @@ def test_a_run_of_jam_leaves_figures_and_an_animation(drawn):
     check_agents(drawn, "jam")
     rows = read(drawn / "threat" / "report.json")
     assert [row["hazard"] for row in rows] == ["obstacle", "wall"] * 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", ["tuned", "paper"])
+def test_a_run_of_point_gather_leaves_figures_and_an_animation(recipe, tmp_path):
+    folder = go("point_gather", tmp_path / recipe, f"--recipe {recipe} --test-bombs 8 --horizon 3")
+    names = ("learning_curves", "threat_fit", "trajectories", "threat_of_all", "threat_of_one_bomb")
+    for name in names:
+        assert (folder / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "animation.gif").read_bytes().startswith(b"GIF8")
+    check_table(folder, ["8 bombs"], [0, 1])
+    check_training(folder, 64, 8)
+
+
+def test_point_gather_has_no_plans():
+    config = point_gather.Config(baseline="plans")
+    with pytest.raises(ValueError, match=r"^baseline is 'plans'; it must be one of 'paper'"):
+        point_gather.make_task(config)
+    with pytest.raises(ValueError, match=r"^test_bombs is \(\)"):
+        point_gather.make_task(point_gather.Config(test_bombs=()))
 
 
 @pytest.mark.slow

@@ -6,9 +6,10 @@ import jax
 import pytest
 from quick import unoptimised
 
-from experiments import circuit, cli, jam
+from experiments import circuit, cli, jam, point_gather
 
-MODULES = {"circuit": circuit, "jam": jam}
+MODULES = {"circuit": circuit, "jam": jam, "point_gather": point_gather}
+KINDS = {"circuit": ["wall"], "jam": ["wall", "obstacle"], "point_gather": ["bomb"]}
 TINY_FIT = "--{0}.fit.steps 40 --{0}.fit.batch 64 --{0}.fit.hidden 16"
 TINY_THREAT = "--{0}.states 200 --{0}.paths 4 --{0}.test-states 200 --{0}.test-paths 8 " + TINY_FIT
 TINY = (
@@ -33,8 +34,7 @@ def programs_of_a_moment():
 
 def go(name, out, *options):
     module = MODULES[name]
-    kinds = ["wall", "obstacle"] if name == "jam" else ["wall"]
-    argv = " ".join([TINY, *(TINY_THREAT.format(kind) for kind in kinds), *options]).split()
+    argv = " ".join([TINY, *(TINY_THREAT.format(kind) for kind in KINDS[name]), *options]).split()
     argv += ["--out", str(out)]
     main = (f"experiments.{name}", module.__doc__, module.PRESETS, module.make_task, argv)
     assert cli.main(*main) == out

@@ -230,7 +230,7 @@ def test_no_key_is_used_twice(monkeypatch):
 
     def act(key, state, *_):
         note(key)
-        return state, loop.Metrics(*[0.0] * 8)
+        return state, loop.Metrics(*[0.0] * 9)
 
     def learn(key, state, *_):
         note(key)
@@ -279,7 +279,7 @@ def test_the_replay_holds_what_happened_and_no_more():
     np.testing.assert_allclose(kept.discount, np.where(ended, 0, gamma**length), rtol=1e-5)
     np.testing.assert_allclose(kept.reward, np.where(ended, gamma ** (length - 1), 0), rtol=1e-5)
     # What is admissible where it led: not to the right, beside the pit.
-    np.testing.assert_array_equal(kept.next_admissible, np.where(to == 5, 0b011, 0b111))
+    np.testing.assert_array_equal(kept.next_admissible[:, 0], np.where(to == 5, 0b011, 0b111))
 
 
 def test_the_replay_starts_with_the_asked_number_of_transitions(compile_soon):
@@ -317,7 +317,7 @@ def test_the_carried_view_is_that_of_the_carried_states():
     percept = jax.jit(pmdp.perceive)(state.states)
     assert alike(percept.encoded, state.seen.encoded)
     np.testing.assert_array_equal(percept.threat, state.seen.threat)
-    allowed = np.asarray(state.seen.bits)[:, None] >> np.arange(3) & 1
+    allowed = np.asarray(state.seen.bits) >> np.arange(3) & 1
     np.testing.assert_array_equal(allowed, percept.admissible)
 
 
@@ -345,7 +345,9 @@ def test_inadmissible_actions_are_counted_if_there_are_any(compile_soon):
     pmdp, _, _ = learned("RP")
     state, _ = start(jax.random.key(7), pmdp, CONFIG)
     beside = jax.vmap(probe.start_at)(jnp.full(32, 5.0))
-    forged = jnp.full(32, 1 << probe.RIGHT, jnp.int32)  # a mask that lets all walk into the pit
+    forged = jnp.full(
+        (32, 1), 1 << probe.RIGHT, jnp.uint32
+    )  # a mask that lets all walk into the pit
     honest = jax.jit(loop._look)(pmdp, beside)
     seen = honest._replace(bits=forged)
     forced = state._replace(states=beside, seen=seen)
@@ -405,7 +407,7 @@ def test_exploration_falls_to_its_end_and_stays():
 
 
 def test_choices_are_greedy_or_uniform_inside_the_mask():
-    values, bits = jnp.asarray([1.0, 5.0, 9.0]), jnp.asarray(0b011)
+    values, bits = jnp.asarray([1.0, 5.0, 9.0]), jnp.asarray([0b011], jnp.uint32)
     keys = jax.random.split(jax.random.key(11), 2000)
     choose = jax.jit(jax.vmap(loop._choose, (0, None, None, None)))
     assert (choose(keys, values, bits, 0.0) == 1).all()

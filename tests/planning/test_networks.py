@@ -68,6 +68,18 @@ def test_the_paper_s_network_is_a_convolution_a_pool_and_tanh_units(bins, pools)
     np.testing.assert_allclose(ask(network, params, encoded), z, rtol=1e-4, atol=1e-5)
 
 
+def test_the_paper_s_network_without_a_lidar_is_two_layers_of_fifty_tanh_units():
+    encoded = seen(bins=0)
+    network = PaperNetwork(num_actions=5, scale=SCALE)
+    params = start(network, jax.random.key(0), encoded)
+    found, z = layers(params), np.asarray(encoded.rest)
+    for name in ("Dense_0", "Dense_1"):
+        z = np.tanh(z @ found[name][0] + found[name][1])
+        assert z.shape == (4, 50)
+    z = z @ found["Dense_2"][0] + found["Dense_2"][1]
+    np.testing.assert_allclose(ask(network, params, encoded), z, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.parametrize("lead", [(), (1,), (2, 3)])
 def test_leading_axes_are_kept(name, lead):

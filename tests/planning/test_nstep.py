@@ -20,7 +20,7 @@ def window(rewards, terminated, done):
         terminated=jnp.asarray(terminated, bool),
         done=jnp.asarray(done, bool),
         next_encoded=seen(10 + count),
-        next_admissible=jnp.arange(n, dtype=jnp.int32) + 100,
+        next_admissible=jnp.arange(n, dtype=jnp.uint32)[:, None] + 100,
     )
 
 
@@ -50,7 +50,7 @@ def test_it_reaches_to_the_first_end_and_only_a_true_end_cuts_the_future(case):
     assert found.encoded.rest.item() == 0
     assert found.action == 5
     assert found.next_encoded.rest.item() == 10 + counted - 1
-    assert found.next_admissible == 100 + counted - 1
+    assert found.next_admissible[0] == 100 + counted - 1
 
 
 @pytest.mark.parametrize(("terminated", "discount"), [(False, GAMMA), (True, 0.0)])

@@ -144,7 +144,7 @@ def episode(steps=6, obstacles=2, crashed=False):
         threat=threat,
         admissible=threat < 0.5,
         secure=rng.random(steps) < 0.5,
-        crashed=crashed,
+        hit=np.arange(steps) == (steps - 1 if crashed else steps),
     )
 
 
@@ -174,6 +174,14 @@ def test_safety_zones_lie_inside_their_corners(corner, round_zones):
     plt.close(figure)
 
 
+def test_rings_stand_about_their_places_and_more_panels_than_three_get_a_second_line(path):
+    rings = [(np.asarray([[1.0, 1.0], [2.0, 1.5]]), 0.3, scenes.BAD)]
+    wide = [("room", SCENE._replace(rings=rings), [episode(crashed=True)])] * 4
+    scenes.trajectories(wide, path)
+    picture = drawn(path)
+    assert picture.shape[0] > 0.55 * picture.shape[1]
+
+
 def test_trajectories(path):
     two = [episode(), episode(steps=1, crashed=True)]
     scenes.trajectories([("one", SCENE, two), ("two", SCENE, two[:1])], path)
@@ -188,6 +196,7 @@ def test_an_animation_has_a_frame_per_step(obstacles, tmp_path):
     scenes.animate(SCENE, shown, (-0.02, 0.0, 0.02), TURNS, 0.5, path, lambda *n: told.append(n))
     with Image.open(path) as picture:
         assert picture.format == "GIF"
+        assert picture.info["duration"] > 300  # short episodes are shown slowly
         assert picture.n_frames == 5
     assert told[-1] == (5, 5)
     assert plt.get_fignums() == []

@@ -5,13 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rp_jax.envs import circuit, jam
-from rp_jax.kinematics import independent_controls, make_vehicle
+from rp_jax.envs import circuit, jam, point_gather
+from rp_jax.kinematics import AgentModel, advance, independent_controls, make_vehicle
 from rp_jax.recon.labels import (
     Labels,
     best_estimator,
     exact_threat,
     label,
+    leaves,
     monte_carlo_threat,
     plan_threat,
 )
@@ -38,10 +39,6 @@ def sub_of(env, kind):
 
 def with_source(sub, **changes):
     return sub.replace(source=sub.source.replace(**changes))
-
-
-def with_agent(sub, **changes):
-    return sub.replace(agent=sub.agent.replace(**changes))
 
 
 def of_cars(states):
@@ -103,6 +100,13 @@ def test_the_reported_error_is_that_of_the_estimate(cars):
     np.testing.assert_allclose(found.stderr[undecided], expected[undecided], rtol=0.15)
 
 
+class Driver(AgentModel):
+    """A vehicle of which the enumeration is not told that its controls act one step later."""
+
+    def step(self, vehicle, control):
+        return advance(vehicle, control, self.speeds)
+
+
 def test_skipping_the_last_control_of_a_delayed_agent_changes_nothing():
     sub = with_source(sub_of(jam, "wall"), horizon=3)
     rng = np.random.default_rng(0)
@@ -110,7 +114,8 @@ def test_skipping_the_last_control_of_a_delayed_agent_changes_nothing():
     agents, points = jax.vmap(sub.source.state_of)(jnp.asarray(states, float))
     key = jax.random.key(0)
     short = enumerate_each(key, agents, points, sub).threat
-    long = enumerate_each(key, agents, points, with_agent(sub, delayed=False)).threat
+    model = Driver(sub.agent.actions, sub.agent.baseline, sub.agent.speeds, delayed=False)
+    long = enumerate_each(key, agents, points, sub.replace(agent=model)).threat
     assert ((long > 0.01) & (long < 0.99)).sum() > 100
     np.testing.assert_allclose(short, long, atol=1e-6)
 
@@ -297,3 +302,22 @@ def test_plans_are_labelled_by_rollouts_of_plans():
     chosen = best_estimator(sub, 7)
     assert chosen.func is plan_threat
     assert chosen is best_estimator(sub, 7)
+
+
+def test_trees_are_enumerated_where_they_are_small_enough():
+    assert leaves(sub_of(circuit, "wall")) == 15 * 9**3
+    subs = {
+        h: point_gather.sub_rmdps(point_gather.make_params(horizon=h))["bomb"] for h in (1, 2, 15)
+    }
+    assert [leaves(subs[h]) for h in (1, 2)] == [81, 81**2]
+    assert best_estimator(subs[2], 10) is exact_threat
+    assert best_estimator(subs[15], 10).func is monte_carlo_threat
+
+
+def test_sampled_threats_of_a_bomb_agree_with_enumerated_ones():
+    sub = point_gather.sub_rmdps(point_gather.make_params(horizon=2))["bomb"]
+    agent, bomb = make_vehicle((5.0, 0.0), 0.3, 0.0), jnp.asarray([5.5, 1.6])
+    true = enumerate_all(jax.random.key(0), agent, bomb, sub).threat
+    found = simulate(jax.random.key(1), agent, bomb, sub, paths=2000)
+    assert ((true > 0.05) & (true < 0.9)).any()
+    assert (np.abs(found.threat - true) <= 5 * found.stderr + 1e-3).all()
