@@ -90,6 +90,10 @@ def stepper(name):
     return advance
 
 
+# Two programs may differ in the last bits of sines and cosines.
+close = functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6)
+
+
 @every_env
 def test_a_batch_takes_the_same_steps_and_keeps_what_an_episode_ended_with(name):
     env, ends = make_vec(name), {"terminated": 0, "truncated": 0}
@@ -101,7 +105,7 @@ def test_a_batch_takes_the_same_steps_and_keeps_what_an_episode_ended_with(name)
         carried, observed, last, outcome = stepper(name)(*args)
         seen, reward, terminated, truncated, info = env.step(action)
         same_bits(env.states, carried)
-        np.testing.assert_array_equal(seen, observed)
+        close(seen, observed)
         np.testing.assert_array_equal(reward, outcome.reward)
         np.testing.assert_array_equal(terminated, outcome.terminated)
         np.testing.assert_array_equal(truncated, outcome.truncated)
@@ -111,7 +115,7 @@ def test_a_batch_takes_the_same_steps_and_keeps_what_an_episode_ended_with(name)
         done = terminated | truncated
         assert ("final_obs" in info) == done.any()
         for row in np.flatnonzero(done):
-            np.testing.assert_array_equal(info["final_obs"][row], last[row])
+            close(info["final_obs"][row], last[row])
             assert (seen[row] != last[row]).any()
             assert info["final_info"]["cost"][row] == outcome.danger[row]
         if done.any():
@@ -119,7 +123,8 @@ def test_a_batch_takes_the_same_steps_and_keeps_what_an_episode_ended_with(name)
             np.testing.assert_array_equal(info["_final_obs"], done)
         ends["terminated"] += terminated.sum()
         ends["truncated"] += truncated.sum()
-    assert min(ends.values()) > 0
+    assert ends["truncated"] > 0
+    assert (ends["terminated"] > 0) == (name != "point_gather")  # where nothing ends an episode
 
 
 def test_a_batch_tells_what_gymnasiums_own_batches_tell():
