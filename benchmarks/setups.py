@@ -32,6 +32,6 @@ def pmdp_of(task: pipeline.Task, config: pipeline.Config) -> PMDP:
         data = fit.Dataset(features, threat)
         settings = task.threats[kind].fit
         model, state = fit.init(jax.random.key(2), sub, data, settings)
-        state, _ = fit.run(model, state, data, jnp.inf, settings, 200)
+        state, _ = fit.run(model, state, data, settings, 200)
         models[kind] = model.replace(params=state.params)
     return pipeline.make_pmdp(task, config, models, task.train)

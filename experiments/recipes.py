@@ -15,7 +15,6 @@ TUNED_OBSTACLE = ThreatConfig(
     states=200_000,
     paths=64,
     sampling="preferential",
-    focus=1.0,
     prudence=0.05,
     fit=FitConfig(hidden=(128, 128, 128), steps=12_000, batch=1024, learning_rate=3e-3),
 )

@@ -30,7 +30,6 @@ class ThreatConfig:
     states: int = 200_000  # labelled start states
     paths: int = 64  # rollouts per state, where the label is not exact
     sampling: str = "uniform"  # of the start states: uniform or preferential
-    focus: float = float("inf")  # threats above so many x count less in the fit, by their ratio
     prudence: float = 1.0  # most states near x with an unsafe action called safe; 1: as fitted
     confidence: float = 0.95  # of that
     test_states: int = 2000  # fresh states that the report is made on
@@ -42,7 +41,6 @@ class ThreatConfig:
         number(f"{name}.states", self.states, least=100, integer=True)
         number(f"{name}.paths", self.paths, least=2, integer=True)
         one_of(f"{name}.sampling", self.sampling, SAMPLINGS)
-        number(f"{name}.focus", self.focus, above=0, infinite=True)
         number(f"{name}.prudence", self.prudence, above=0, most=1)
         number(f"{name}.confidence", self.confidence, above=0, most=0.999999)
         number(f"{name}.test_states", self.test_states, least=10, integer=True)
@@ -74,14 +72,10 @@ def fitted(
     sub: SubRMDP,
     data: Dataset,
     config: FitConfig,
-    focus: float = np.inf,
     on_progress: Progress | None = None,
     chunks: int = 20,
 ) -> tuple[ThreatModel, list[dict[str, float]]]:
-    """Fits a model to labelled states and their mirror images; returns it and its curve.
-
-    `focus` is that of `fit.cross_entropy`.
-    """
+    """Fits a model to labelled states and their mirror images; returns it and its curve."""
     split_key, init_key = jax.random.split(key)
     train, held = fit.split(split_key, data, config.validation)
     train = fit.mirror(train, sub)
@@ -90,7 +84,7 @@ def fitted(
     config = dataclasses.replace(config, steps=length * chunks)
     curve = []
     for i in range(chunks):
-        state, loss = _run(model, state, train, focus, config=config, steps=length)
+        state, loss = _run(model, state, train, config=config, steps=length)
         now = model.replace(params=state.params)
         logits = now.logits(held.features)
         error = jnp.mean(jnp.abs(jax.nn.sigmoid(logits) - held.threat))
@@ -98,7 +92,7 @@ def fitted(
             {
                 "step": (i + 1) * length,
                 "loss": float(jnp.mean(loss)),
-                "validation_loss": float(fit.cross_entropy(logits, held.threat, focus)),
+                "validation_loss": float(fit.cross_entropy(logits, held.threat)),
                 "validation_mae": float(error),
             }
         )
@@ -182,13 +176,12 @@ def build(
     estimator = labels.best_estimator(sub, config.paths)
     accurate = labels.best_estimator(sub, config.test_paths)
     began = time.perf_counter()
-    focus = config.focus * x if x > 0 else np.inf
     first = config.states // 2 if config.sampling == "preferential" else config.states
     features = sampling.uniform(keys[0], sub, first)
     data = _labelled(keys[1], features, sub, estimator, "labels", on_progress)
     if config.sampling == "preferential":
         short = dataclasses.replace(config.fit, steps=config.fit.steps // 4)
-        scout, _ = fitted(keys[2], sub, data, short, focus, on_progress)
+        scout, _ = fitted(keys[2], sub, data, short, on_progress)
         more = sampling.preferential(
             keys[3], sub, scout, data.features, data.threat, x, config.states - first
         )
@@ -196,7 +189,7 @@ def build(
         data = Dataset(*map(jnp.concatenate, zip(data, extra, strict=True)))
     jax.block_until_ready(data)
     labelled = time.perf_counter()
-    model, curve = fitted(keys[5], sub, data, config.fit, focus, on_progress)
+    model, curve = fitted(keys[5], sub, data, config.fit, on_progress)
     facts = {}
     if config.prudence < 1:
         hard = near_threshold(keys[8], sub, model, x, config.test_states)

@@ -74,17 +74,9 @@ def split(key: Array, data: Dataset, share: float) -> tuple[Dataset, Dataset]:
     return part(order[held:]), part(order[:held])
 
 
-def cross_entropy(logits: Array, threat: Array, focus: Array | float = jnp.inf) -> Array:
-    """Mean cross entropy; unbiased under noisy labels, least at their expectation.
-
-    Args:
-        logits: (...) predictions.
-        threat: (...) labels.
-        focus: pairs predicted to be far above it count less, in inverse proportion, so that errors
-            near it count by their ratio; at infinity all count alike.
-    """
-    weight = 1 / (1 + jax.lax.stop_gradient(jax.nn.sigmoid(logits)) / focus)
-    return jnp.mean(weight * optax.sigmoid_binary_cross_entropy(logits, threat))
+def cross_entropy(logits: Array, threat: Array) -> Array:
+    """Mean cross entropy; unbiased under noisy labels, least at their expectation."""
+    return jnp.mean(optax.sigmoid_binary_cross_entropy(logits, threat))
 
 
 def optimiser(config: FitConfig) -> optax.GradientTransformation:
@@ -109,18 +101,13 @@ def init(
 
 
 def run(
-    model: ThreatModel,
-    state: FitState,
-    data: Dataset,
-    focus: Array | float,
-    config: FitConfig,
-    steps: int,
+    model: ThreatModel, state: FitState, data: Dataset, config: FitConfig, steps: int
 ) -> tuple[FitState, Array]:
     """`steps` gradient steps in one scan. Returns the state and the loss of each step."""
     transform = optimiser(config)
 
     def loss(params, features, threat):
-        return cross_entropy(model.replace(params=params).logits(features), threat, focus)
+        return cross_entropy(model.replace(params=params).logits(features), threat)
 
     def step(state: FitState, _):
         key, draw = jax.random.split(state.key)

@@ -32,7 +32,7 @@ def toy():
 
 @functools.partial(jax.jit, static_argnames=("config", "steps"))
 def run(model, state, data, config, steps):
-    return fit.run(model, state, data, jnp.inf, config, steps)
+    return fit.run(model, state, data, config, steps)
 
 
 def start(key=1, config=CONFIG):
@@ -171,29 +171,3 @@ def test_the_mirror_s_labels_are_those_of_the_mirrored_states(env, exact):
 def test_bad_settings_are_named(change, field):
     with pytest.raises(ValueError, match=rf"^wall\.fit\.{field} is .*must"):
         dataclasses.replace(CONFIG, **change).validate("wall.fit")
-
-
-def test_errors_count_by_their_ratio_above_the_focus():
-    """A gap of one in the logits costs as much at .01 as at .1, where without focus ten times."""
-    true = jnp.asarray([0.01, 0.1])
-    logits = jnp.log(true / (1 - true))
-
-    def cost(i, focus):
-        at = lambda gap: fit.cross_entropy(logits[i] + gap, true[i], focus)  # noqa: E731
-        return float(jnp.square(jax.grad(at)(0.5)))
-
-    plain = cost(1, jnp.inf) / cost(0, jnp.inf)
-    focused = cost(1, 1e-3) / cost(0, 1e-3)
-    assert 50 < plain < 150
-    assert 0.5 < focused < 2
-    everywhere = fit.cross_entropy(logits, true)
-    assert everywhere == fit.cross_entropy(logits, true, jnp.inf)
-
-
-@pytest.mark.parametrize("focus", [1e-3, 0.1, jnp.inf])
-def test_whatever_the_focus_the_expectation_of_noisy_labels_is_best(focus):
-    labels = jnp.asarray([0.0] * 9 + [1.0])
-    slope = jax.grad(lambda logit: fit.cross_entropy(jnp.full(10, logit), labels, focus))
-    best = float(jnp.log(0.1 / 0.9))
-    assert abs(slope(best)) < 1e-7
-    assert slope(best - 0.5) < 0 < slope(best + 0.5)
