@@ -1,0 +1,65 @@
+"""All methods side by side, as small as they get."""
+
+import dataclasses
+import functools
+import json
+import sys
+
+import pytest
+from tiny import programs_of_a_moment  # noqa: F401
+
+from experiments import compare
+from rp_jax.baselines import cpo, pid_lagrangian
+from rp_jax.baselines.actor_critic import ActorCriticConfig
+
+SMALL = ActorCriticConfig(num_envs=8, length=16, epochs=1, minibatches=2)
+
+
+@pytest.mark.slow
+def test_every_method_has_its_rows(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(cpo, "CPOConfig", functools.partial(cpo.CPOConfig, SMALL))
+    monkeypatch.setattr(
+        pid_lagrangian, "PIDConfig", functools.partial(pid_lagrangian.PIDConfig, SMALL)
+    )
+    monkeypatch.setitem(compare.SETTINGS, "circuit", ((0.0, 20.0), 1e-3, 1))
+    out = tmp_path / "compare"
+    words = "compare --env circuit --steps 6000 --episodes 8 --mpc-episodes 2"
+    files = ["--threat", str(finished / "threat"), "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", [*words.split(), *files])
+    compare.main()
+    rows = json.loads((out / "compare.json").read_text())
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    assert methods == [
+        *("RP (x=0.001)", "DQN (penalty 0)", "DQN (penalty 20)"),
+        *("CPO", "PID-Lagrangian", "MPC (1 steps)"),
+    ]
+    for method in methods:
+        mine = [row for row in rows if row["method"] == method]
+        assert len(mine) == 3  # tracks
+        for row in mine:
+            assert row["episodes"] == (2 if "MPC" in method else 8)
+            assert row["crash_ci95"][0] <= row["crash_rate"] <= row["crash_ci95"][1]
+            assert row["seconds_per_100_actions"] > 0
+            assert (row["training_steps"] >= 6000) == ("MPC" not in method)
+            assert row["training_danger"] <= row["training_episodes"]
+    shown = capsys.readouterr().out
+    for variant in {row["variant"] for row in rows}:
+        assert f"circuit {variant}" in shown
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"env": "maze"}, "env"),
+        ({"methods": ("SAC",)}, "methods"),
+        ({"methods": ()}, "methods"),
+        ({"steps": 10}, "steps"),
+        ({"episodes": 0}, "episodes"),
+        ({"mpc_episodes": 0}, "mpc_episodes"),
+        ({"seeds": 0}, "seeds"),
+    ],
+)
+def test_bad_settings_are_named(change, field):
+    config = dataclasses.replace(compare.Config("jam"), **change)
+    with pytest.raises(ValueError, match=f"^{field} is "):
+        compare.settings_of(config)
