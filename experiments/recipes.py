@@ -15,7 +15,7 @@ TUNED_OBSTACLE = ThreatConfig(
     states=200_000,
     paths=64,
     sampling="preferential",
-    prudence=0.05,
+    prudence=0.02,
     fit=FitConfig(hidden=(128, 128, 128), steps=12_000, batch=1024, learning_rate=3e-3),
 )
 

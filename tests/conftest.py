@@ -1,3 +1,4 @@
+import gc
 from pathlib import Path
 
 import jax
@@ -8,10 +9,20 @@ from hypothesis import settings
 from rp_jax.recon.labels import exact_threat, monte_carlo_threat
 
 PATHS = 4096
+MAPS = Path("/proc/self/maps")  # where the system has it
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 settings.register_profile("rp_jax", deadline=None, derandomize=True, database=None, max_examples=30)
 settings.load_profile("rp_jax")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_programs():
+    """Compiled programs stay mapped in memory, and Linux allows a process 65,530 maps."""
+    yield
+    if MAPS.exists() and len(MAPS.read_bytes().splitlines()) > 20_000:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")
