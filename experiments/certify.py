@@ -18,7 +18,6 @@ import tyro
 import rp_jax
 from experiments import cli, console, pipeline, runs
 from rp_jax import evaluate, statistics, storage
-from rp_jax.planning import loop
 from rp_jax.validate import number
 
 ROUND = 1000  # episodes side by side
@@ -51,11 +50,7 @@ def run(config: Config) -> dict[str, Any]:
     expected = config.c / 2 if config.expected is None else config.expected
     n, allowed = statistics.plan_test(config.c, config.confidence, expected, 0.9)
     loaded = runs.load(config.run)
-    number("agent", config.agent, most=loaded.config.seeds - 1)
-    variant = config.variant or next(iter(loaded.task.tests))
-    pmdp = loaded.pmdp(variant)
-    network = loop.make_network(loaded.config.planning, pmdp)
-    params = jax.tree.map(lambda a: a[config.agent], loaded.params)
+    variant, pmdp, network, params = loaded.subject(config.variant, config.agent)
     console.say(
         f"plan: {n:,} episodes of {loaded.task.name} {variant}; {allowed} crashes or fewer show "
         f"a rate of at most {config.c:g} at {100 * config.confidence:g} % confidence"

@@ -9,7 +9,7 @@ python -m experiments.compare --env jam
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -176,7 +176,7 @@ def _evaluated(
             found = jax.tree.map(np.asarray, everyone(keys, weights, this))
             start = jax.vmap(this.env.reset, (0, None))(keys[:1], params)
             first = jax.tree.map(lambda a: a[0], weights)
-            seconds = _hundred(functools.partial(act, start, first, this))
+            seconds = pipeline.seconds_of_100(functools.partial(act, start, first, this))
             for i, member in enumerate(members):
                 rows.append(
                     {
@@ -192,15 +192,6 @@ def _evaluated(
                 )
             bar("", done + 1, len(task.tests))
     return rows
-
-
-def _hundred(act: Callable[[], jax.Array]) -> float:
-    """Seconds of 100 calls, the first one apart."""
-    act().block_until_ready()
-    began = time.perf_counter()
-    for _ in range(100):
-        act().block_until_ready()
-    return time.perf_counter() - began
 
 
 def by_search(config: Config, horizon: int) -> list[dict[str, Any]]:

@@ -65,15 +65,7 @@ def play(
     key: jax.Array, search: mpc.Search, episodes: int, bar: console.Bar
 ) -> tuple[evaluate.Episodes, float]:
     """All episodes, a group after another, and the seconds it took without compilation."""
-    nothing = jnp.zeros(())
-    pmdp = mpc.Omniscient(
-        params=search.params,
-        threats=None,
-        x=jnp.asarray(jnp.inf),
-        penalty=nothing,
-        toll=nothing,
-        env=search.model,
-    )
+    pmdp = mpc.omniscient(search)
     size = min(GROUP, episodes)
 
     def group(key: jax.Array, pmdp: mpc.Omniscient, search: mpc.Search) -> evaluate.Episodes:

@@ -18,7 +18,6 @@ import tyro
 from experiments import cli, console, pipeline, runs
 from rp_jax import evaluate, rare, statistics, storage
 from rp_jax.envs.base import select
-from rp_jax.planning import loop
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import number
 
@@ -172,11 +171,8 @@ def worst_starts(key: jax.Array, subject: Subject, first: Any, config: Config) -
 
 def run(config: Config, loaded: runs.Run, folder: Path) -> dict[str, Any]:
     """Writes rare.json and, after a search, worst_starts.npz."""
-    number("agent", config.agent, most=loaded.config.seeds - 1)
-    variant = config.variant or next(iter(loaded.task.tests))
-    pmdp = loaded.pmdp(variant)
-    network = loop.make_network(loaded.config.planning, pmdp)
-    values = evaluate.greedy(network, jax.tree.map(lambda a: a[config.agent], loaded.params))
+    variant, pmdp, network, weights = loaded.subject(config.variant, config.agent)
+    values = evaluate.greedy(network, weights)
     subject = Subject(pmdp, values, rare.compiled(values))
     key, search, check = jax.random.split(pipeline.key_of(config.seed, pipeline.RARE), 3)
     row, starts = estimates(key, subject, config)

@@ -11,15 +11,25 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from flax import linen as nn
 
 from experiments import circuit, jam, pipeline, point_gather
 from rp_jax import storage
 from rp_jax.planning import loop
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.threat import artefact
-from rp_jax.validate import one_of
+from rp_jax.validate import number, one_of
 
 EXPERIMENTS: dict[str, Any] = {"circuit": circuit, "jam": jam, "point_gather": point_gather}
+
+
+class Subject(NamedTuple):
+    """An agent and where it is tested."""
+
+    variant: str
+    pmdp: PMDP
+    network: nn.Module
+    weights: Any
 
 
 class Run(NamedTuple):
@@ -39,6 +49,18 @@ class Run(NamedTuple):
         """
         params = self.task.tests[one_of("variant", variant, self.task.tests)]
         return pipeline.make_pmdp(self.task, self.config, self.models, params)
+
+    def subject(self, variant: str, agent: int) -> "Subject":
+        """One agent in one of the tests; "" is the first of them.
+
+        Raises:
+            ValueError: there is no such test or agent.
+        """
+        number("agent", agent, least=0, most=self.config.seeds - 1, integer=True)
+        variant = variant or next(iter(self.task.tests))
+        pmdp = self.pmdp(variant)
+        weights = jax.tree.map(lambda a: a[agent], self.params)
+        return Subject(variant, pmdp, loop.make_network(self.config.planning, pmdp), weights)
 
 
 def load(folder: Path) -> Run:

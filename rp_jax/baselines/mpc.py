@@ -253,6 +253,19 @@ class Omniscient(PMDP):
         return percept._replace(encoded=Seen(states, needed))  # type: ignore[arg-type]
 
 
+def omniscient(search: Search) -> Omniscient:
+    """What a search is evaluated in: its environment, with nothing forbidden."""
+    nothing = jnp.zeros(())
+    return Omniscient(
+        params=search.params,
+        threats=None,
+        x=jnp.asarray(jnp.inf),
+        penalty=nothing,
+        toll=nothing,
+        env=search.model,
+    )
+
+
 def policy(search: Search) -> Callable[[Percept], Array]:
     """Scores (B, A) of actions, for `evaluate.run_episodes` with an `Omniscient`.
 

@@ -252,24 +252,12 @@ def test_parameters_and_penalties_need_no_new_program():
     assert len(traced) == 1
 
 
-def omniscient(search):
-    zero = jnp.zeros(())
-    return mpc.Omniscient(
-        params=search.params,
-        threats=None,
-        x=jnp.asarray(jnp.inf),
-        penalty=zero,
-        toll=zero,
-        env=search.model,
-    )
-
-
 def test_it_is_evaluated_as_any_policy():
     search = search_of("jam", 2, num_obstacles=3, time_limit=6)
     run = jax.jit(
         lambda key, pmdp: evaluate.run_episodes(key, pmdp, mpc.policy(search), 8, batch=4)
     )
-    rows = run(jax.random.key(0), omniscient(search))
+    rows = run(jax.random.key(0), mpc.omniscient(search))
     assert rows.length.shape == (8,)
     assert (rows.length[rows.danger == 0] == 6).all()
     assert (rows.interventions == 0).all()
@@ -279,11 +267,13 @@ def test_it_is_evaluated_as_any_policy():
 def test_the_state_is_seen_by_nobody_else():
     search = search_of("jam", 2, num_obstacles=3)
     states = rows_of(crowded())
-    seen = omniscient(search).perceive(states).encoded
+    seen = mpc.omniscient(search).perceive(states).encoded
     assert isinstance(seen, mpc.Seen)
     np.testing.assert_array_equal(seen.states.obstacles.position, states.obstacles.position)
     assert seen.alive.all()
-    plain = mpc.PMDP(**{f: getattr(omniscient(search), f) for f in mpc.PMDP.__dataclass_fields__})
+    plain = mpc.PMDP(
+        **{f: getattr(mpc.omniscient(search), f) for f in mpc.PMDP.__dataclass_fields__}
+    )
     assert plain.perceive(states).encoded._fields == ("scan", "rest")
 
 
