@@ -29,7 +29,7 @@ class HazardSource(Protocol):
 
     @property
     def window(self) -> "Window":
-        """Where the hazard can matter within `horizon` steps; outside it the threat is 0."""
+        """Holds every hazard that is `in_reach` at some speed, in the agent's frame."""
 
     @property
     def horizon(self) -> int:
@@ -48,6 +48,9 @@ class HazardSource(Protocol):
     def hits(self, agent: Any, hazard: Any) -> Array:
         """() bool, the event's indicator d_n."""
 
+    def in_reach(self, agent: Any, hazard: Any) -> Array:
+        """() bool, it may be hit within `horizon` steps; elsewhere the threat is 0."""
+
     def features(self, agent: Any, hazard: Any) -> Array:
         """(F,) what the threat model sees: the agent's frame, relative position first."""
 
@@ -55,7 +58,7 @@ class HazardSource(Protocol):
         """`features` (..., F) of the left-right mirrored situation."""
 
     def sample(self, key: Array, agent: AgentModel) -> tuple[Any, Any]:
-        """An (agent, hazard) pair drawn over the window, every speed included."""
+        """An (agent, hazard) pair drawn over what is `in_reach`, every speed included."""
 
     def state_of(self, features: Array) -> tuple[Any, Any]:
         """An (agent, hazard) pair that has these features (F,); inverts `features`."""
@@ -73,6 +76,10 @@ class Window(struct.PyTreeNode):
         outside = (x < self.lower[0]) | (x > self.upper[0])
         return ~(outside | (y < self.lower[1]) | (y > self.upper[1]))
 
+    def padded(self, pad: Array) -> "Window":
+        """Wider by `pad` () on every side."""
+        return Window(self.lower - pad, self.upper + pad)
+
 
 class SubRMDP(struct.PyTreeNode):
     """The R-MDP of a single hazard: Algorithm 2, line 2, estimates its threat function."""
@@ -82,32 +89,44 @@ class SubRMDP(struct.PyTreeNode):
     beta: Array | float = 0.999  # discount of danger
 
 
-def reach(agent: AgentModel, horizon: int) -> tuple[np.ndarray, np.ndarray]:
-    """A box (lower, upper) in the agent's frame that holds it for `horizon` steps.
+class Reach(struct.PyTreeNode):
+    """Where a vehicle can get within some moves, by the speed it begins with."""
 
-    Covers every sequence of actions and baseline controls, from every speed.
-    """
-    turns = [np.abs(np.asarray(angle_of(agent.actions.rotation))).max()]
-    turns.append(np.abs(np.asarray(angle_of(agent.baseline.rotations))).max())
-    slow, fast = float(agent.speeds[0]), float(agent.speeds[-1])
-    if agent.room is not None:  # who slides along a wall goes aside at any heading, but no farther
-        far = np.full(2, horizon * max(-slow, fast))
-        return -far, far
-    lower, upper = np.zeros(2), np.zeros(2)
-    for k in range(horizon):
-        # Largest change of heading before the k-th move.
-        swing = min((k if agent.delayed else k + 1) * max(turns), np.pi)
-        upper[0] += max(fast, slow * np.cos(swing), 0.0)
-        lower[0] += min(slow, fast * np.cos(swing), 0.0)
-        side = max(abs(slow), fast) * np.sin(min(swing, np.pi / 2))
-        upper[1] += side
-        lower[1] -= side
-    return lower, upper
+    limits: Array  # (2,) slowest and fastest, room units / step
+    change: Array  # (H,) greatest change of speed before each move
+    swing: Array  # (H, 2) (cos, sin) of the largest turn before each move; sin counts to 90 degrees
+
+    @classmethod
+    def create(cls, agent: AgentModel, horizon: int) -> "Reach":
+        """Covers every sequence of actions and baseline controls for `horizon` steps."""
+        base = agent.baseline
+        turns = [np.asarray(angle_of(table)) for table in (agent.actions.rotation, base.rotations)]
+        stronger = [np.asarray(agent.actions.acceleration), np.asarray(base.strongest)]
+        moves = np.arange(horizon) + (not agent.delayed)
+        swing = np.minimum(moves * max(np.abs(turn).max() for turn in turns), np.pi)
+        change = moves * max(np.abs(part).max() for part in stronger)
+        if agent.room is not None:  # who slides along a wall goes aside at any heading
+            swing, change = np.full(horizon, np.pi), np.full(horizon, np.inf)
+        sides = np.where(swing < np.pi / 2, np.sin(swing), 1.0)
+        return cls(
+            limits=jnp.asarray(agent.speeds)[jnp.asarray([0, -1])],
+            change=jnp.asarray(change, float),
+            swing=jnp.asarray(np.stack([np.cos(swing), sides], axis=-1), float),
+        )
+
+    def box(self, speed: Array) -> Window:
+        """What it may come by, in its own frame; its place now is inside. `speed` is ()."""
+        low, high = jnp.minimum(self.limits[0], speed), jnp.maximum(self.limits[1], speed)
+        slow = jnp.maximum(low, speed - self.change)
+        fast = jnp.minimum(high, speed + self.change)
+        back = self.swing[:, 0]
+        ahead = jnp.sum(jnp.maximum(jnp.maximum(fast, slow * back), 0.0))
+        behind = jnp.sum(jnp.minimum(jnp.minimum(slow, fast * back), 0.0))
+        side = jnp.sum(jnp.maximum(jnp.abs(slow), jnp.abs(fast)) * self.swing[:, 1])
+        return Window(jnp.stack([behind, -side]), jnp.stack([ahead, side]))
 
 
-def _padded_window(agent: AgentModel, horizon: int, pad: float) -> Window:
-    lower, upper = reach(agent, horizon)
-    return Window(lower=jnp.asarray(lower - pad, float), upper=jnp.asarray(upper + pad, float))
+MARGIN = 1e-5  # room units by which windows are too wide, for rounding
 
 
 def _sample_speed(key: Array, speeds: Array) -> Array:
@@ -122,19 +141,37 @@ def _sample_relative(key: Array, window: Window) -> Array:
     return jax.random.uniform(key, (2,), window.lower.dtype, window.lower, window.upper)
 
 
+def _union(one: Window, other: Window) -> Window:
+    return Window(jnp.minimum(one.lower, other.lower), jnp.maximum(one.upper, other.upper))
+
+
 class WallPoint(struct.PyTreeNode):
     """A fixed point that must not come nearer than `radius`. The hazard is its position (2,)."""
 
     radius: Array  # () room units
-    window: Window
+    reach: Reach  # of the agent
     horizon: int = struct.field(pytree_node=False, default=5)
     static: bool = struct.field(pytree_node=False, default=True)
 
     @classmethod
     def create(cls, agent: AgentModel, radius: float = 0.1, horizon: int = 5) -> "WallPoint":
-        """With the window that `agent` can reach in `horizon` steps."""
-        window = _padded_window(agent, horizon, radius)
-        return cls(radius=jnp.asarray(radius, float), window=window, horizon=horizon)
+        """With what `agent` can reach in `horizon` steps."""
+        reach = Reach.create(agent, horizon)
+        return cls(radius=jnp.asarray(radius, float), reach=reach, horizon=horizon)
+
+    def window_at(self, speed: Array) -> Window:
+        """Where a point may be hit, in the frame of an agent that begins with `speed` ()."""
+        return self.reach.box(speed).padded(self.radius + MARGIN)
+
+    @property
+    def window(self) -> Window:
+        """See `HazardSource`."""
+        return _union(*map(self.window_at, self.reach.limits))
+
+    def in_reach(self, agent: Vehicle, hazard: Array) -> Array:
+        """See `HazardSource`."""
+        relative = to_ego(hazard - agent.position, agent.heading)
+        return self.window_at(agent.speed).contains(relative)
 
     def draw(self, key: Array, shape: tuple[int, ...] = ()) -> Array:
         """Nothing is random; zeros keep the signature."""
@@ -162,7 +199,7 @@ class WallPoint(struct.PyTreeNode):
         """See `HazardSource`."""
         where, fast = jax.random.split(key)
         vehicle = make_vehicle(jnp.zeros(2), 0.0, _sample_speed(fast, agent.speeds))
-        return vehicle, _sample_relative(where, self.window)
+        return vehicle, _sample_relative(where, self.window_at(vehicle.speed))
 
     def state_of(self, features: Array) -> tuple[Vehicle, Array]:
         """See `HazardSource`."""
@@ -182,13 +219,17 @@ class Bomb(WallPoint):
     def create(
         cls, agent: AgentModel, radius: float = 1.0, horizon: int = 15, ahead: float = 0.0
     ) -> "Bomb":
-        """With the window that `agent` can reach in `horizon` steps."""
+        """With what `agent` can reach in `horizon` steps."""
         return cls(
             radius=jnp.asarray(radius, float),
-            window=_padded_window(agent, horizon, radius + ahead),
+            reach=Reach.create(agent, horizon),
             horizon=horizon,
             ahead=jnp.asarray(ahead, float),
         )
+
+    def window_at(self, speed: Array) -> Window:
+        """See `WallPoint`."""
+        return super().window_at(speed).padded(jnp.asarray(self.ahead))
 
     def centre(self, agent: Vehicle) -> Array:
         """(2,) the agent's centre of mass."""
@@ -239,7 +280,8 @@ class MovingObstacle(struct.PyTreeNode):
     distance: Array  # () room units, sum of the two radii
     speeds: Array  # (S,) its reachable speeds, ascending
     behaviour: ControlDistribution  # what it does at each step
-    window: Window
+    reach: Reach  # of the agent
+    drift: Array  # (H,) greatest gain of an obstacle's speed before each of its moves
     horizon: int = struct.field(pytree_node=False, default=8)
     static: bool = struct.field(pytree_node=False, default=False)
 
@@ -252,15 +294,33 @@ class MovingObstacle(struct.PyTreeNode):
         distance: float = 0.2,
         horizon: int = 8,
     ) -> "MovingObstacle":
-        """With the window from which it and `agent` can meet in `horizon` steps."""
-        pad = distance + horizon * float(np.abs(np.asarray(speeds)).max())
+        """With what it and `agent` can reach in `horizon` steps."""
         return cls(
             distance=jnp.asarray(distance, float),
             speeds=jnp.asarray(speeds, float),
             behaviour=behaviour,
-            window=_padded_window(agent, horizon, pad),
+            reach=Reach.create(agent, horizon),
+            drift=jnp.arange(horizon) * behaviour.strongest,
             horizon=horizon,
         )
+
+    def window_at(self, speed: Array, other: Array) -> Window:
+        """Where they may meet: by the agent's speed and the `other`'s, whatever its heading."""
+        other = jnp.abs(other)
+        limit = jnp.maximum(jnp.max(jnp.abs(self.speeds)), other)
+        fast = jnp.minimum(limit, other + self.drift)
+        return self.reach.box(speed).padded(self.distance + jnp.sum(fast) + MARGIN)
+
+    @property
+    def window(self) -> Window:
+        """See `HazardSource`."""
+        ends = [self.window_at(speed, self.speeds[-1]) for speed in self.reach.limits]
+        return _union(*ends)
+
+    def in_reach(self, agent: Vehicle, hazard: Vehicle) -> Array:
+        """See `HazardSource`."""
+        relative = to_ego(hazard.position - agent.position, agent.heading)
+        return self.window_at(agent.speed, hazard.speed).contains(relative)
 
     def draw(self, key: Array, shape: tuple[int, ...] = ()):
         """The obstacle's controls, of the given shape."""
@@ -290,9 +350,9 @@ class MovingObstacle(struct.PyTreeNode):
         """See `HazardSource`."""
         where, turn, own, other = jax.random.split(key, 4)
         angle = jax.random.uniform(turn, (), float, -jnp.pi, jnp.pi)
-        position = _sample_relative(where, self.window)
-        hazard = make_vehicle(position, angle, _sample_speed(other, self.speeds))
-        return make_vehicle(jnp.zeros(2), 0.0, _sample_speed(own, agent.speeds)), hazard
+        speed, faster = _sample_speed(own, agent.speeds), _sample_speed(other, self.speeds)
+        position = _sample_relative(where, self.window_at(speed, faster))
+        return make_vehicle(jnp.zeros(2), 0.0, speed), make_vehicle(position, angle, faster)
 
     def state_of(self, features: Array) -> tuple[Vehicle, Vehicle]:
         """See `HazardSource`."""

@@ -35,6 +35,11 @@ class ControlDistribution(struct.PyTreeNode):
         """(K, 2) every turn it may take."""
         return self.controls.rotation
 
+    @property
+    def strongest(self) -> Array:
+        """() greatest change of speed in a step."""
+        return jnp.max(jnp.abs(self.controls.acceleration))
+
     def sample(self, key: Array, shape: tuple[int, ...] = ()) -> Control:
         """Draws controls of the given shape, by inverting the cumulative distribution."""
         uniform = jax.random.uniform(key, shape, self.probabilities.dtype)

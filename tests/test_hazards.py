@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rp_jax.envs import circuit, jam, point_gather
-from rp_jax.hazards import MovingObstacle, WallPoint, Window, reach
+from rp_jax.hazards import MovingObstacle, Reach, WallPoint, Window
 from rp_jax.kinematics import (
     Control,
     Vehicle,
@@ -15,7 +15,7 @@ from rp_jax.kinematics import (
     make_vehicle,
     mirrored_actions,
 )
-from rp_jax.recon.labels import exact_threat
+from rp_jax.recon.labels import exact_threat, label, monte_carlo_threat
 
 KINDS = [(circuit, "wall"), (jam, "wall"), (jam, "obstacle")]
 NAMES = ["circuit-wall", "jam-wall", "jam-obstacle"]
@@ -102,8 +102,11 @@ def encounters(env, kind):
 def test_whatever_can_be_hit_within_the_horizon_lies_in_the_window(env, kind, x64):
     features, _, hit = encounters(env, kind)
     assert hit.all()  # they do meet
-    window = jax.device_get(sub_of(env, kind).source.window)
+    source = sub_of(env, kind).source
+    window = jax.device_get(source.window)
     assert window.contains(features[:, :2]).all()
+    reached = jax.jit(jax.vmap(lambda f: source.in_reach(*source.state_of(f))))(features)
+    assert reached.all()
     # The window is not so wide that anything would pass: ahead it is nearly reached.
     assert features[:, 0].max() > 0.95 * window.upper[0]
     assert features[:, 1].max() > 0.8 * window.upper[1]
@@ -143,8 +146,46 @@ def test_the_farthest_meeting_lies_just_inside_the_window(env, kind, side, x64):
     relative = source.features(agent, hazard)[:2]
     window = source.window
     assert window.contains(relative)
+    assert source.in_reach(agent, hazard)
     limit = towards @ np.where(towards > 0, window.upper, window.lower)
-    np.testing.assert_allclose(towards @ relative, limit, atol=1e-6)
+    np.testing.assert_allclose(towards @ relative, limit, atol=2e-5)
+
+
+@pytest.mark.parametrize("speed", SPEEDS)
+@pytest.mark.parametrize("direction", [1, -1])
+def test_what_is_in_reach_ahead_depends_on_the_speed_as_worked_out(speed, direction, x64):
+    sub = sub_of(circuit, "wall")
+    speeds = [speed]
+    for _ in range(sub.source.horizon - 1):
+        speeds.append(np.clip(speeds[-1] + direction * 0.02, -0.04, 0.1))
+    # Where it stands now is a place it comes by; on a straight way those are all between.
+    farthest = max(0, *(direction * np.cumsum(speeds))) + 0.1
+    agent = make_vehicle((0.0, 0.0), 0.0, speed)
+    inside, outside = [jnp.asarray([direction * (farthest + d), 0.0]) for d in (-1e-9, 2e-2)]
+    assert sub.source.in_reach(agent, inside)
+    # Turning round costs more than a step's reach here, so nothing else leads there.
+    beyond = sub.source.in_reach(agent, outside)
+    assert not beyond or direction * speed < 0
+
+
+def test_a_speed_beyond_the_limits_is_believed(x64):
+    sub = sub_of(circuit, "wall")
+    agent = make_vehicle((0.0, 0.0), 0.0, 0.5)  # moves .5, then at most .48, ...
+    assert sub.source.in_reach(agent, jnp.asarray([2.0, 0.0]))
+
+
+@each_kind
+def test_what_is_out_of_reach_has_no_threat(env, kind):
+    sub = sub_of(env, kind)
+    key, spread = jax.random.key(3), sub.source.window
+    agents, hazards = jax.vmap(sub.source.sample, (0, None))(jax.random.split(key, 4000), sub.agent)
+    anywhere = jax.random.uniform(key, (4000, 2), float, spread.lower, spread.upper)
+    hazards = anywhere if kind == "wall" else hazards.replace(position=anywhere)
+    out = ~jax.jit(jax.vmap(sub.source.in_reach))(agents, hazards)
+    assert 0.1 < out.mean() < 0.95
+    estimator = exact_threat if kind == "wall" else functools.partial(monte_carlo_threat, paths=16)
+    found = label(key, pick(agents, out), pick(hazards, out), sub, estimator)
+    assert (found.threat == 0).all()
 
 
 @each_kind
@@ -158,10 +199,11 @@ def test_the_window_grows_with_the_horizon(env, kind):
 
 
 def test_the_reach_of_the_circuits_vehicle_is_that_worked_out_by_hand():
-    lower, upper = reach(circuit.make_params().agent, 2)
+    reach = Reach.create(circuit.make_params().agent, 2)
+    lower, upper = reach.box(jnp.asarray(-0.04)).lower, reach.box(jnp.asarray(0.1)).upper
     # Full speed ahead, or reversing, for two steps; the second up to .15 rad to the side.
     np.testing.assert_allclose(upper, [0.2, 0.1 * np.sin(0.15)], atol=1e-6)
-    np.testing.assert_allclose(lower, [-0.08, -0.1 * np.sin(0.15)], atol=1e-6)
+    np.testing.assert_allclose(lower, [-0.08, -0.04 * np.sin(0.15)], atol=1e-6)
 
 
 def test_a_window_contains_its_corners_and_nothing_outside():
@@ -199,6 +241,10 @@ def test_samples_fill_the_window_and_hold_the_reachable_speeds(env, kind):
     lower, upper = np.asarray(sub.source.window.lower), np.asarray(sub.source.window.upper)
     assert (features[:, :2] >= lower).all()
     assert (features[:, :2] <= upper).all()
+    assert jax.vmap(sub.source.in_reach)(agents, hazards).all()
+    at = sub.source.window_at
+    speeds = [agents.speed] if kind == "wall" else [agents.speed, hazards.speed]
+    lower, upper = (np.asarray(a) for a in jax.tree.leaves(jax.vmap(at)(*speeds)))
     share = (features[:, :2] - lower) / (upper - lower)
     assert (
         np.abs(np.quantile(share, [0.25, 0.5, 0.75], axis=0).T - [0.25, 0.5, 0.75]) < 0.03
@@ -391,7 +437,8 @@ def test_what_a_point_meets_within_the_horizon_lies_in_the_window(x64):
     assert sub.source.window.contains(relative).all()
     assert relative[:, 0].max() > 0.9 * sub.source.window.upper[0]
     # Nobody turns that far in time: they slide along walls.
-    free = reach(sub.agent.replace(room=None), 4)[1][1] + 1 + point_gather.AHEAD
+    reach = Reach.create(sub.agent.replace(room=None), 4)
+    free = reach.box(reach.limits[1]).upper[1] + 1 + point_gather.AHEAD
     assert np.abs(relative[:, 1]).max() > free
 
 

@@ -41,6 +41,10 @@ def exact_threat(key: Array, agent: Any, hazard: Any, sub: SubRMDP) -> Labels:
     assert isinstance(model.baseline, ControlDistribution)
     controls, probabilities = model.baseline.controls, model.baseline.probabilities
     any_control = jax.tree.map(lambda table: table[0], controls)
+    count, last = len(probabilities), source.horizon - 1 - model.delayed
+
+    def step(agent: Any, control: Any) -> Any:
+        return jax.lax.optimization_barrier(model.step(agent, control))
 
     def value(agent: Any, k: int) -> Array:
         """E[beta^(K - k)] from the agent's state at step k, for all steps up to the horizon."""
@@ -49,13 +53,17 @@ def exact_threat(key: Array, agent: Any, hazard: Any, sub: SubRMDP) -> Labels:
             later = jnp.zeros_like(sub.beta)
         elif k == source.horizon - 1 and model.delayed:
             later = value(model.step(agent, any_control), k + 1)
+        elif k >= last:  # added up one after another: XLA would do all levels anew for each leaf
+            rows = [jax.tree.map(lambda table, i=i: table[i], controls) for i in range(count)]
+            values = [value(model.step(agent, control), k + 1) for control in rows]
+            later = sum(p * v for p, v in zip(probabilities, values, strict=True))
         else:
-            branch = jax.vmap(lambda control: value(model.step(agent, control), k + 1))
+            branch = jax.vmap(lambda control: value(step(agent, control), k + 1))
             later = jnp.sum(probabilities * branch(controls))
         return jnp.where(hit, 1.0, sub.beta * later)
 
     def first(action: Any) -> Array:
-        return value(model.step(agent, action), 1)
+        return value(step(agent, action), 1)
 
     threat = jax.vmap(first)(model.actions) * sub.beta
     threat = jnp.where(source.hits(agent, hazard), 1.0, threat)
@@ -138,6 +146,7 @@ def _first_hit(
 def _average(values: Array) -> Labels:
     """Mean over paths (paths, ...) and its standard error."""
     paths = values.shape[0]
+    values = jax.lax.optimization_barrier(values)  # or each sum would roll out anew
     spread = jnp.std(values, axis=0, ddof=1) if paths > 1 else jnp.ones(values.shape[1])
     return Labels(threat=jnp.mean(values, axis=0), stderr=spread / jnp.sqrt(paths))
 
@@ -187,7 +196,7 @@ def label(
     sub: SubRMDP,
     estimator: Estimator,
     *,
-    batch: int = 32,
+    batch: int = 16,
     rows: int = 8192,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Labels:

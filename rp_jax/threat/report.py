@@ -46,9 +46,9 @@ def compare(predicted: np.ndarray, true: np.ndarray, x: float) -> dict[str, floa
 
 
 def predict(model: ThreatModel, features: Array) -> Array:
-    """(n, A) threats of features (n, F); 0 outside the window, as `total_threat` has it."""
-    inside = model.source.window.contains(features[:, :2])
-    return jnp.where(inside[:, None], model(features), 0.0)
+    """(n, A) threats of features (n, F); 0 for what is out of reach, as `total_threat` has it."""
+    reached = jax.vmap(lambda row: model.source.in_reach(*model.source.state_of(row)))(features)
+    return jnp.where(reached[:, None], model(features), 0.0)
 
 
 def labelled_sum(
@@ -63,9 +63,9 @@ def labelled_sum(
         sub: their sub-R-MDP.
         estimator: labels a single (agent, hazard).
     """
-    inside = np.asarray(_inside(agents, hazards, sub))
-    row, column = np.nonzero(inside)
-    total = np.zeros((inside.shape[0], sub.agent.num_threats))
+    reached = np.asarray(_reached(agents, hazards, sub))
+    row, column = np.nonzero(reached)
+    total = np.zeros((reached.shape[0], sub.agent.num_threats))
     if len(row):
         agent = jax.tree.map(lambda a: a[row], agents)
         hazard = jax.tree.map(lambda a: a[row, column], hazards.state)
@@ -75,6 +75,6 @@ def labelled_sum(
 
 
 @jax.jit
-def _inside(agents: Any, hazards: Hazards, sub: Any) -> Array:
-    features = jax.vmap(jax.vmap(sub.source.features, (None, 0)))(agents, hazards.state)
-    return sub.source.window.contains(features[..., :2]) & hazards.present
+def _reached(agents: Any, hazards: Hazards, sub: Any) -> Array:
+    reached = jax.vmap(jax.vmap(sub.source.in_reach, (None, 0)))(agents, hazards.state)
+    return reached & hazards.present

@@ -10,13 +10,13 @@ from jax import Array
 from rp_jax.envs.base import Hazards
 from rp_jax.threat.model import ThreatModel
 
-CHUNK = 2048  # rows per call of a network; fixed, so that no result depends on the batch
+CHUNK = 256  # rows per call of a network; fixed, so that no result depends on the batch
 
 
 def total_threat(
     models: Mapping[str, ThreatModel], agents: Any, hazards: Mapping[str, Hazards]
 ) -> Array:
-    """sum_n T_n(s, .) over all hazards inside their windows, for a batch of states (Theorem 3).
+    """sum_n T_n(s, .) over all hazards in reach, for a batch of states (Theorem 3).
 
     The theorem bounds rollouts that are not cut: the models' horizon leaves out what happens after
     it, up to beta^horizon per unit of danger.
@@ -46,14 +46,15 @@ def total_threat(
 
 
 def _summed(model: ThreatModel, agents: Any, hazards: Hazards) -> Array:
-    """(B, A) of one kind. Only hazards inside the window reach the network.
+    """(B, A) of one kind. Only hazards in reach are shown to the network.
 
-    They are packed tightly first: few of the candidates lie inside, and how many varies much
+    They are packed tightly first: few of the candidates are in reach, and how many varies much
     from state to state.
     """
     over_hazards = jax.vmap(model.source.features, (None, 0))
     features = jax.vmap(over_hazards)(agents, hazards.state)  # (B, n, F)
-    inside = model.source.window.contains(features[..., :2]) & hazards.present
+    reached = jax.vmap(jax.vmap(model.source.in_reach, (None, 0)))(agents, hazards.state)
+    inside = reached & hazards.present
     batch, n = inside.shape
     if n == 0:
         return jnp.zeros((batch, model.network.num_actions), features.dtype)
