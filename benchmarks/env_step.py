@@ -14,6 +14,7 @@ from rp_jax.envs import base, circuit, jam, point_gather
 STEPS = 100
 BATCH = 1024
 BATCHES = (1, 16, 256, 4096, 16_384)  # beside BATCH
+SWEPT = ("circuit", "jam N=8")  # over all batches
 MOST = 200_000  # environment steps of a call, so that large batches do not take longer
 
 
@@ -51,14 +52,18 @@ def row(name: str, env: Any, params: Any, observed: bool, batch: int) -> Row:
     return measure(title, "steps", batch, batch * turns, program, *made, pieces=pieces)
 
 
+def cases() -> dict[str, tuple[Any, Any]]:
+    """Circuit, Jam among 3, 8, 15 and 50 obstacles, and Point Gather: modules and parameters."""
+    found: dict[str, tuple[Any, Any]] = {"circuit": (circuit, circuit.make_params())}
+    found |= {f"jam N={n}": (jam, jam.make_params(n)) for n in (3, 8, 15, 50)}
+    return found | {"point gather": (point_gather, point_gather.make_params())}
+
+
 def run(batch: int = BATCH, batches: Sequence[int] = BATCHES) -> list[Row]:
-    """Circuit, Jam among 3, 8, 15 and 50 obstacles, Point Gather; two of them at all batches."""
-    cases: dict[str, tuple[Any, Any]] = {"circuit": (circuit, circuit.make_params())}
-    cases |= {f"jam N={n}": (jam, jam.make_params(n)) for n in (3, 8, 15, 50)}
-    cases["point gather"] = (point_gather, point_gather.make_params())
-    rows = [row(name, *case, look, batch) for name, case in cases.items() for look in (False, True)]
-    rows += [row(name, *cases[name], True, b) for name in ("circuit", "jam N=8") for b in batches]
-    return rows
+    """All of them at one batch size, with and without observations; two at all sizes."""
+    found = cases()
+    rows = [row(name, *case, look, batch) for name, case in found.items() for look in (False, True)]
+    return rows + [row(name, *found[name], True, b) for name in SWEPT for b in batches]
 
 
 if __name__ == "__main__":
