@@ -21,19 +21,19 @@ class Jam:
     The observation is what our network sees: the pooled LIDAR and the rest, of the order of 1.
     """
 
-    def __init__(self, spaces: Any):
-        """`spaces`: gymnax's module."""
-        self._spaces = spaces
+    def __init__(self, discrete: Any, box: Any):
+        """`discrete` and `box` are gymnax's spaces."""
+        self._discrete, self._box = discrete, box
         self.default_params = jam.make_params()
 
     def action_space(self, params: jam.Params) -> Any:
         """15 actions."""
-        return self._spaces.Discrete(jam.num_actions(params))
+        return self._discrete(jam.num_actions(params))
 
     def observation_space(self, params: jam.Params) -> Any:
         """(81,) floats."""
         size = jam.LIDAR_BINS // networks.POOLS["tuned"] + len(jam.SCALE)
-        return self._spaces.Box(-100.0, 100.0, (size,), jnp.float32)
+        return self._box(-100.0, 100.0, (size,), jnp.float32)
 
     def _seen(self, state: jam.State, params: jam.Params) -> jax.Array:
         seen = encode(jam.observe(state, params), jam.LIDAR_BINS, networks.POOLS["tuned"])
@@ -64,7 +64,7 @@ def run() -> list[Row]:
     _, config = tasks()["jam"]
     planning = config.planning
     network = networks.TunedNetwork(num_actions=15, scale=jam.SCALE)
-    env = Jam(spaces)
+    env = Jam(spaces.Discrete, spaces.Box)
     learner = DQN.create(
         env=env,
         num_envs=planning.num_envs,

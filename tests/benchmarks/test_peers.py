@@ -43,7 +43,7 @@ def test_the_numpy_step_is_ours_transition_for_transition():
     rng, params = np.random.default_rng(0), jam.make_params()
     transition, observe = jax.jit(jam.transition), jax.jit(jam.observe)
     seen = {"crashed": 0, "goal": 0, "gone": 0, "safe": 0}
-    for trial in range(200):
+    for trial in range(100):
         agent = vehicles(rng, jam.SPEEDS)
         if trial % 4 == 0:
             agent[:2] = 2.6 + rng.uniform(-0.2, 0.2), 2.95
@@ -73,7 +73,7 @@ def test_the_numpy_step_is_ours_transition_for_transition():
         seen["goal"] += found.goal
         seen["gone"] += bool(gone.any())
         seen["safe"] += not found.done
-    assert min(seen.values()) > 5, seen
+    assert min(seen.values()) > 2, seen
 
 
 def test_numpy_episodes_begin_and_end():
@@ -88,15 +88,8 @@ def test_numpy_episodes_begin_and_end():
         state = numpy_jam.reset(rng) if found.done else found.state
 
 
-class Spaces:
-    """In place of gymnax's."""
-
-    Discrete = staticmethod(lambda n: n)
-    Box = staticmethod(lambda low, high, shape, dtype: shape)
-
-
 def test_the_adapter_shows_what_our_network_sees():
-    env = rejax_dqn.Jam(Spaces)
+    env = rejax_dqn.Jam(lambda n: n, lambda low, high, shape, dtype: shape)
     params = env.default_params
     assert (env.action_space(params), env.observation_space(params)) == (15, (81,))
     seen, state = jax.jit(env.reset)(jax.random.key(0), params)
