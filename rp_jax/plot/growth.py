@@ -39,7 +39,7 @@ def _panel(axis: plt.Axes, one: Mapping[str, Any]) -> None:
     sizes, seconds = (np.asarray(one[name], float) for name in ("sizes", "seconds"))
     ends = [np.asarray(one[name], float) for name in ("fastest", "slowest")]
     spread = np.stack([np.maximum(seconds - ends[0], 0), np.maximum(ends[1] - seconds, 0)])
-    axis.errorbar(sizes, seconds, spread, color=BLUE, marker="o", ms=4, lw=1, capsize=2)
+    axis.errorbar(sizes, seconds, spread, color=BLUE, fmt="o", ms=4, capsize=2)
     large, slope = sizes[-one["fitted"] :], one["slope"]
     middle = np.exp(np.mean(np.log(seconds[-one["fitted"] :]) - slope * np.log(large)))
     axis.plot(large, middle * large**slope, color=RED, ls="--", label=f"slope {slope:.2f}")
