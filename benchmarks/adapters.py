@@ -1,15 +1,14 @@
 """gymnasium's vector environment against the jitted step that it calls, both from Python."""
 
 import itertools
-import resource
-import statistics
 import time
 from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
 
-from benchmarks.measure import Row, main
+from benchmarks.measure import Row, row_of
+from benchmarks.report import main
 from rp_jax.adapters import registry
 from rp_jax.envs import base
 
@@ -70,14 +69,12 @@ def run(batch: int = 1024) -> list[Row]:
         actions = list(np.asarray(draws))
         rates = alternated([raw(name, batch), adapted(name, batch)], actions)
         shares = [after / before for before, after in zip(*rates, strict=True)]
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        for title, unit, found in (
-            (f"{name}, raw step", "steps", [batch * rate for rate in rates[0]]),
-            (f"{name}, gymnasium", "steps", [batch * rate for rate in rates[1]]),
-            (f"{name}, gymnasium / raw", "ratio", shares),
-        ):
-            middle = statistics.median(found)
-            rows.append(Row(title, unit, batch, middle, min(found), max(found), 0.0, peak))
+        raw_steps, adapted_steps = ([batch * rate for rate in found] for found in rates)
+        rows += [
+            row_of(f"{name}, raw step", "steps", batch, raw_steps),
+            row_of(f"{name}, gymnasium", "steps", batch, adapted_steps),
+            row_of(f"{name}, gymnasium / raw", "ratio", batch, shares),
+        ]
     return rows
 
 

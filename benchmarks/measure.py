@@ -1,21 +1,16 @@
 """How a benchmark is taken: compile time apart, the median of repeats with their spread."""
 
-import argparse
-import os
-import platform
+import dataclasses
 import resource
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import jax
 
-import rp_jax
-from experiments import console
-from rp_jax import storage
+from benchmarks.bound import Bound, Piece, bound, counted, work_of
 
 
 @dataclass(frozen=True)
@@ -30,6 +25,19 @@ class Row:
     fastest: float
     compile_seconds: float
     peak_mib: float  # of the process so far
+    program_mib: float | None = None  # the program's arguments, results and scratch memory
+    bound: Bound | None = None  # None where Python drives
+
+
+def peak_mib() -> float:
+    """The most memory that this process has held so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def row_of(name: str, unit: str, batch: int, rates: Sequence[float]) -> Row:
+    """A row of rates that Python took, with nothing compiled."""
+    middle = statistics.median(rates)
+    return Row(name, unit, batch, middle, min(rates), max(rates), 0.0, peak_mib())
 
 
 def measure(
@@ -41,6 +49,7 @@ def measure(
     *arguments: Any,
     repeats: int = 5,
     carried: bool = False,
+    pieces: Sequence[Piece] | None = None,
 ) -> Row:
     """Compiles `function`, runs it once to warm up, then `repeats` times.
 
@@ -53,11 +62,13 @@ def measure(
         *arguments: of the call.
         repeats: timed calls.
         carried: the first result is the next call's first argument, and its memory is given away.
+        pieces: whose work is that of a call; needed where `function` loops (`bound.work_of`).
     """
     began = time.perf_counter()
-    given = (0,) if carried else ()
-    compiled = jax.jit(function, donate_argnums=given).lower(*arguments).compile()
+    lowered = jax.jit(function, donate_argnums=(0,) if carried else ()).lower(*arguments)
+    compiled = lowered.compile()
     compile_seconds = time.perf_counter() - began
+    work = counted(lowered, compiled) if pieces is None else work_of(pieces)
     rates = []
     for _ in range(repeats + 1):
         began = time.perf_counter()
@@ -65,58 +76,28 @@ def measure(
         rates.append(count / (time.perf_counter() - began))
         if carried:
             arguments = (result[0], *arguments[1:])
-    rates = rates[1:]  # the first call warms up
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return Row(
-        name, unit, batch, statistics.median(rates), min(rates), max(rates), compile_seconds, peak
+    row = row_of(name, unit, batch, rates[1:])  # the first call warms up
+    return dataclasses.replace(
+        row,
+        compile_seconds=compile_seconds,
+        program_mib=_program_mib(compiled),
+        bound=bound(work, count, row.per_second),
     )
 
 
-def machine() -> dict[str, Any]:
-    """What was measured on, and with what."""
-    return {
-        "device": jax.devices()[0].device_kind,
-        "platform": jax.default_backend(),
-        "processor": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "python": platform.python_version(),
-        "jax": jax.__version__,
-        "rp_jax": rp_jax.__version__,
-    }
+def recount(row: Row, unit: str, factor: float) -> Row:
+    """The same measurement in another unit, `factor` of which make one of the row's."""
+    work = row.bound and dataclasses.replace(
+        row.bound, operations=row.bound.operations / factor, bytes=row.bound.bytes / factor
+    )
+    speeds = (factor * rate for rate in (row.per_second, row.slowest, row.fastest))
+    middle, slowest, fastest = speeds
+    return dataclasses.replace(
+        row, unit=unit, per_second=middle, slowest=slowest, fastest=fastest, bound=work
+    )
 
 
-def _short(number: float) -> str:
-    """Three digits and k, M or G."""
-    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
-        if number >= size:
-            return f"{number / size:.3g}{unit}"
-    return f"{number:.3g}"
-
-
-def report(name: str, rows: Sequence[Row], out: Path | None) -> None:
-    """Prints the rows, and writes them as JSON if `out` is given."""
-    same = len({row.unit for row in rows}) == 1
-    shown = [
-        {
-            "what": row.name if same else f"{row.name} ({row.unit})",
-            "batch": row.batch,
-            f"{row.unit} / s" if same else "per second": _short(row.per_second),
-            "spread": f"{_short(row.slowest)} .. {_short(row.fastest)}",
-            "compile s": f"{row.compile_seconds:.2f}",
-            "peak MiB": f"{row.peak_mib:,.0f}",
-        }
-        for row in rows
-    ]
-    console.table(name, shown, list(shown[0]))
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        rows_json = [asdict(row) for row in rows]
-        storage.write_json(out / f"{name}.json", {"machine": machine(), "rows": rows_json})
-
-
-def main(name: str, run: Callable[[], list[Row]]) -> None:
-    """The command line of one benchmark."""
-    parser = argparse.ArgumentParser(prog=f"python -m benchmarks.{name}")
-    parser.add_argument("--out", type=Path, help="folder for the JSON")
-    out = parser.parse_args().out
-    report(name, run(), out)
+def _program_mib(compiled: Any) -> float:
+    sizes = compiled.memory_analysis()
+    parts = sizes.argument_size_in_bytes + sizes.output_size_in_bytes + sizes.temp_size_in_bytes
+    return (parts - sizes.alias_size_in_bytes) / 2**20

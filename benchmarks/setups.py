@@ -1,14 +1,17 @@
 """P-MDPs with untrained threat models of the tuned sizes: speed does not depend on the weights."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
+from benchmarks.bound import Piece
 from experiments import circuit as circuit_experiment
 from experiments import jam as jam_experiment
 from experiments import pipeline
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.recon import sampling
-from rp_jax.threat import fit
+from rp_jax.threat import fit, total
 
 
 def tasks() -> dict[str, tuple[pipeline.Task, pipeline.Config]]:
@@ -35,3 +38,35 @@ def pmdp_of(task: pipeline.Task, config: pipeline.Config) -> PMDP:
         state, _ = fit.run(model, state, data, settings, 200)
         models[kind] = model.replace(params=state.params)
     return pipeline.make_pmdp(task, config, models, task.train)
+
+
+def inside(pmdp: PMDP, states: Any) -> dict[str, int]:
+    """By kind, how many pairs of a state and a hazard inside its window reach the network."""
+    assert pmdp.threats is not None
+    found = {}
+    hazards = jax.jit(jax.vmap(pmdp.env.hazards, (0, None)))(states, pmdp.params)
+    for kind, group in hazards.items():
+        source = pmdp.threats[kind].source
+        over_hazards = jax.vmap(source.features, (None, 0))
+        features = jax.jit(jax.vmap(over_hazards))(states.agent, group.state)
+        within = source.window.contains(features[..., :2]) & group.present
+        found[kind] = int(jnp.sum(within))
+    return found
+
+
+def more_chunks(pmdp: PMDP, states: Any, turns: float = 1.0) -> list[Piece]:
+    """What a query of the threat works beyond the first turn of its loops over chunks of pairs.
+
+    Args:
+        pmdp: with models.
+        states: leading axis (B,), of the kind that is asked for.
+        turns: queries.
+    """
+    assert pmdp.threats is not None
+    pieces = []
+    for kind, pairs in inside(pmdp, states).items():
+        model = pmdp.threats[kind]
+        rows = jnp.zeros((total.CHUNK, len(model.scale)))
+        others = max(0, -(-pairs // total.CHUNK) - 1)
+        pieces.append(Piece(lambda model, rows: model(rows), (model, rows), turns * others))
+    return pieces

@@ -2,13 +2,18 @@
 
 import jax
 
-from benchmarks.measure import Row, main, measure
-from benchmarks.setups import pmdp_of, tasks
+from benchmarks.bound import Piece
+from benchmarks.measure import Row, measure, recount
+from benchmarks.report import main
+from benchmarks.setups import inside, more_chunks, pmdp_of, tasks
 from rp_jax import evaluate
 
 
-def run(batches: tuple[int, ...] = (1, 16, 256, 4096)) -> list[Row]:
-    """States per second, all actions and all hazards of each, by batch."""
+def run(batches: tuple[int, ...] = (1, 16, 256, 4096, 16_384)) -> list[Row]:
+    """States per second, all actions and all hazards of each, by batch.
+
+    "pairs" are those of a state and a hazard inside its window; only they reach a network.
+    """
     rows = []
     for name, (task, config) in tasks().items():
         pmdp = pmdp_of(task, config)
@@ -17,7 +22,11 @@ def run(batches: tuple[int, ...] = (1, 16, 256, 4096)) -> list[Row]:
                 jax.random.key(0), pmdp, batch
             )
             program = lambda pmdp, states: pmdp.threat(states)  # noqa: E731
-            rows.append(measure(name, "states", batch, batch, program, pmdp, states, repeats=20))
+            made = (pmdp, states)
+            pieces = [Piece(program, made), *more_chunks(pmdp, states)]
+            row = measure(name, "states", batch, batch, program, *made, repeats=20, pieces=pieces)
+            pairs = sum(inside(pmdp, states).values())
+            rows += [row, recount(row, "pairs", max(1, pairs) / batch)]
     return rows
 
 

@@ -2,28 +2,40 @@
 
 import jax
 
-from benchmarks.measure import Row, main, measure
-from benchmarks.setups import pmdp_of, tasks
+from benchmarks.bound import Piece
+from benchmarks.measure import Row, measure, recount
+from benchmarks.report import main
+from benchmarks.setups import more_chunks, pmdp_of, tasks
 from rp_jax.planning import loop
+from rp_jax.planning.loop import LoopConfig
+from rp_jax.planning.pmdp import PMDP
 
 ITERATIONS = 100
+
+
+def row(title: str, pmdp: PMDP, planning: LoopConfig) -> Row:
+    """The loop with the settings `planning`."""
+    state, _ = jax.jit(loop.init, static_argnums=2)(jax.random.key(0), pmdp, planning)
+
+    def program(state, pmdp, iterations=ITERATIONS):
+        return loop.chunk(state, pmdp, planning, iterations)
+
+    one = Piece(lambda state, pmdp: program(state, pmdp, 1), (state, pmdp), ITERATIONS)
+    pieces = [one]
+    if pmdp.threats is not None:
+        pieces += more_chunks(pmdp, state.states, ITERATIONS)
+    batch = planning.num_envs
+    made = (program, state, pmdp)
+    return measure(title, "steps", batch, ITERATIONS * batch, *made, carried=True, pieces=pieces)
 
 
 def run() -> list[Row]:
     """Acting, environment, observation, threat, replay and learning, tuned recipe."""
     rows = []
     for name, (task, config) in tasks().items():
-        pmdp, planning = pmdp_of(task, config), config.planning
-        state, _ = jax.jit(loop.init, static_argnums=2)(jax.random.key(0), pmdp, planning)
-
-        def program(state, pmdp, planning=planning):
-            return loop.chunk(state, pmdp, planning, ITERATIONS)
-
-        count = ITERATIONS * planning.num_envs
-        title = f"{name}, {planning.samples_per_step:g} samples a step"
-        rows.append(
-            measure(title, "steps", planning.num_envs, count, program, state, pmdp, carried=True)
-        )
+        samples = config.planning.samples_per_step
+        found = row(f"{name}, {samples:g} samples a step", pmdp_of(task, config), config.planning)
+        rows += [found, recount(found, "samples", samples)]
     return rows
 
 

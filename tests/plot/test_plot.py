@@ -10,7 +10,7 @@ from matplotlib import image as images
 from matplotlib import pyplot as plt
 from PIL import Image
 
-from rp_jax.plot import curves, maps, scenes, tabular
+from rp_jax.plot import curves, growth, maps, scenes, tabular
 
 rng = np.random.default_rng(0)
 
@@ -240,3 +240,20 @@ def test_figures_of_finite_cmdps(tmp_path):
     for name in ("a", "b", "c"):
         drawn(tmp_path / f"{name}.png")
     assert plt.get_fignums() == []
+
+
+@pytest.mark.parametrize("panels", [1, 3])
+def test_growth(panels, path):
+    one = {
+        "title": "title",
+        "size": "environments",
+        "vertical": "step",
+        "sizes": [1, 4, 16],
+        "seconds": [1.0, 2.0, 4.0],
+        "fastest": [0.9, 1.9, 4.0],
+        "slowest": [1.1, 2.1, 8.0],
+        "slope": 0.5,
+        "fitted": 2,
+    }
+    growth.growth(panels * [one], path)
+    drawn(path)

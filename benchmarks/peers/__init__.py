@@ -1,0 +1,1 @@
+"""Others on the same task and machine, in one run: `python -m benchmarks.peers`."""

@@ -1,0 +1,134 @@
+"""What a benchmark says: a table, a JSON file, and ratios to an earlier run."""
+
+import argparse
+import os
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import rp_jax
+from benchmarks.bound import Bound, limits
+from benchmarks.compare import Key, earlier, key_of
+from benchmarks.measure import Row
+from experiments import console
+from rp_jax import storage
+
+
+def machine() -> dict[str, Any]:
+    """What was measured on, and with what."""
+    return {
+        "device": jax.devices()[0].device_kind,
+        "platform": jax.default_backend(),
+        "processor": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "rp_jax": rp_jax.__version__,
+        "limits": limits()._asdict(),
+    }
+
+
+def short(number: float) -> str:
+    """Three digits and k, M or G."""
+    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
+        if number >= size:
+            return f"{number / size:.3g}{unit}"
+    return f"{number:.3g}"
+
+
+def _what(row: Row, same: bool) -> dict[str, str]:
+    return {"what": row.name if same else f"{row.name} ({row.unit})", "batch": str(row.batch)}
+
+
+def _speed(row: Row, same: bool, before: Mapping[Key, float]) -> dict[str, str]:
+    """A line of the first table."""
+    cells = _what(row, same)
+    cells[f"{row.unit} / s" if same else "per second"] = short(row.per_second)
+    if before:
+        old = before.get(key_of(row))
+        cells["x earlier"] = "-" if old is None else f"{row.per_second / old:.2f}"
+    program = "-" if row.program_mib is None else f"{row.program_mib:,.1f}"
+    return cells | {
+        "spread": f"{short(row.slowest)} .. {short(row.fastest)}",
+        "compile s": f"{row.compile_seconds:.2f}",
+        "program MiB": program,
+        "peak MiB": f"{row.peak_mib:,.0f}",
+    }
+
+
+def _limits(row: Row, bound: Bound, same: bool) -> dict[str, str]:
+    """A line of the second table."""
+    return _what(row, same) | {
+        "operations": short(bound.operations),
+        "bytes": short(bound.bytes),
+        "of matrix rate": f"{100 * bound.arithmetic:.2g} %",
+        "of copy rate": f"{100 * bound.memory:.2g} %",
+        "limit": bound.limit,
+    }
+
+
+def _print(name: str, rows: Sequence[Row], before: Mapping[Key, float]) -> None:
+    same = len({row.unit for row in rows}) == 1
+    speeds = [_speed(row, same, before) for row in rows]
+    console.table(name, speeds, list(speeds[0]))
+    bounds = [_limits(row, row.bound, same) for row in rows if row.bound]
+    if bounds:
+        best = limits()
+        title = (
+            f"{name}, of one unit; limits: {short(best.operations)} operations/s in a matrix "
+            f"product, {short(best.bytes)} bytes/s in a copy"
+        )
+        console.table(title, bounds, list(bounds[0]))
+
+
+def report(
+    name: str, rows: Sequence[Row], out: Path | None, before: Mapping[Key, float] | None = None
+) -> None:
+    """Prints the rows, and writes them as JSON if `out` is given.
+
+    Args:
+        name: of the benchmark, and of the file.
+        rows: at least one.
+        out: folder, created if missing.
+        before: units per second of an earlier run, by row; adds a column of ratios.
+    """
+    _print(name, rows, before or {})
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        rows_json = [asdict(row) for row in rows]
+        storage.write_json(out / f"{name}.json", {"machine": machine(), "rows": rows_json})
+
+
+def command_line(
+    program: str, benchmarks: Mapping[str, Callable[[], list[Row]]], out: Path | None
+) -> None:
+    """Runs and reports benchmarks, by name; all that was given is read before.
+
+    Args:
+        program: as it is called.
+        benchmarks: by name.
+        out: default folder for the JSON.
+    """
+    parser = argparse.ArgumentParser(prog=program)
+    parser.add_argument("--out", type=Path, default=out, help="folder for the JSON")
+    parser.add_argument(
+        "--against", type=Path, help="JSON of an earlier run, or a folder of them, to compare with"
+    )
+    given = parser.parse_args()
+    before = {}
+    if given.against is not None:
+        try:
+            before = earlier(given.against, list(benchmarks))
+        except ValueError as error:
+            parser.error(str(error))
+    for name, run in benchmarks.items():
+        report(name, run(), given.out, before)
+
+
+def main(name: str, run: Callable[[], list[Row]]) -> None:
+    """The command line of one benchmark."""
+    command_line(f"python -m benchmarks.{name}", {name: run}, None)

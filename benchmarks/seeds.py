@@ -1,0 +1,42 @@
+"""Agent steps per second of training runs side by side, of all of them together."""
+
+import jax
+
+from benchmarks.bound import Piece
+from benchmarks.measure import Row, measure
+from benchmarks.report import main
+from benchmarks.setups import more_chunks, pmdp_of, tasks
+from experiments import pipeline
+from rp_jax.planning import loop
+
+ITERATIONS = 25
+
+
+def run(counts: tuple[int, ...] = (1, 2, 4, 8, 16)) -> list[Row]:
+    """The loop on Jam, vmapped over seeds; the batch is their number."""
+    task, config = tasks()["jam"]
+    one, planning = pmdp_of(task, config), config.planning
+    rows = []
+    for count in counts:
+        members = [
+            pipeline.Member(seed, config.x, config.learning_penalty) for seed in range(count)
+        ]
+        pmdp, axes = pipeline.side_by_side(one, members)
+        init = jax.jit(jax.vmap(loop.init, (0, axes, None)), static_argnums=2)
+        state, _ = init(pipeline.keys_of(members, pipeline.PLANNING), pmdp, planning)
+
+        def program(state, pmdp, iterations=ITERATIONS, axes=axes):
+            chunk = jax.vmap(loop.chunk, (0, axes, None, None))
+            return chunk(state, pmdp, planning, iterations)
+
+        turn = Piece(lambda s, p, program=program: program(s, p, 1), (state, pmdp), ITERATIONS)
+        first = jax.tree.map(lambda a: a[0], state.states)
+        pieces = [turn, *more_chunks(one, first, count * ITERATIONS)]
+        steps = count * planning.num_envs * ITERATIONS
+        made = ("jam", "steps", count, steps, program, state, pmdp)
+        rows.append(measure(*made, repeats=3, carried=True, pieces=pieces))
+    return rows
+
+
+if __name__ == "__main__":
+    main("seeds", run)
