@@ -83,12 +83,12 @@ def fisher_product(
 def step_lengths(
     q: Array, r: Array, s: Array, excess: Array, delta: float
 ) -> tuple[Array, Array, Array]:
-    """Solves max g'x subject to excess + b'x <= 0 and x'Hx / 2 <= delta (equations 11 and 12).
+    """Solves max g'x subject to excess + b'x <= 0 and x'Hx / 2 <= delta, by its dual.
 
     With v = H^-1 g and w = H^-1 b the solution is x = along v - against w: `along` is 1 / lambda
     and `against` nu / lambda in the dual's multipliers. Where the best step of the trust region
     keeps the constraint, nu is 0; else the best one lies on both boundaries. Where no step of the
-    trust region keeps it, x reduces the danger as fast as can be (equation 14).
+    trust region keeps it, x reduces the danger as fast as can be (their recovery step).
 
     Args:
         q: () g'v.
