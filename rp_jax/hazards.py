@@ -21,6 +21,37 @@ from rp_jax.kinematics import (
 )
 
 
+class Agent(Protocol):
+    """Whoever acts: `kinematics.AgentModel`, or a body of any simulator.
+
+    States and controls are pytrees of its own; the methods are unbatched.
+    """
+
+    actions: Any  # table of controls, leading axis (A,)
+    baseline: Any  # eta^(o): a ControlDistribution over such controls, or Plans
+
+    @property
+    def num_threats(self) -> int:
+        """Threats of a state: A of them under one baseline policy."""
+
+    @property
+    def delayed(self) -> bool:
+        """Whether a control moves the agent one step later only."""
+
+    def control(self, action: Array) -> Any:
+        """The command of an action."""
+
+    def step(self, agent: Any, control: Any) -> Any:
+        """The agent's next state, p(s_o' | s_o, a)."""
+
+    def mirrored_threats(self) -> np.ndarray:
+        """(num_threats,) index of each action's left-right mirror image.
+
+        Where there is no such symmetry, `np.arange(num_threats)`; then `HazardSource.mirrored`
+        must return its argument.
+        """
+
+
 class HazardSource(Protocol):
     """One kind of event: how its hazards move, when they strike, how a model sees them.
 
@@ -54,7 +85,7 @@ class HazardSource(Protocol):
     def mirrored(self, features: Array) -> Array:
         """`features` (..., F) of the left-right mirrored situation."""
 
-    def sample(self, key: Array, agent: AgentModel) -> tuple[Any, Any]:
+    def sample(self, key: Array, agent: Any) -> tuple[Any, Any]:
         """An (agent, hazard) pair drawn over the window, every speed included."""
 
     def state_of(self, features: Array) -> tuple[Any, Any]:
@@ -73,11 +104,15 @@ class Window(struct.PyTreeNode):
         outside = (x < self.lower[0]) | (x > self.upper[0])
         return ~(outside | (y < self.lower[1]) | (y > self.upper[1]))
 
+    def sample(self, key: Array) -> Array:
+        """(2,) a relative position, uniform over the box."""
+        return jax.random.uniform(key, (2,), self.lower.dtype, self.lower, self.upper)
+
 
 class SubRMDP(struct.PyTreeNode):
     """The R-MDP of a single hazard: Algorithm 2, line 2, estimates its threat function."""
 
-    agent: AgentModel
+    agent: Any  # an Agent
     source: Any  # a HazardSource
     beta: Array | float = 0.999  # discount of danger
 
@@ -105,21 +140,18 @@ def reach(agent: AgentModel, horizon: int) -> tuple[np.ndarray, np.ndarray]:
     return lower, upper
 
 
-def _padded_window(agent: AgentModel, horizon: int, pad: float) -> Window:
+def padded_window(agent: AgentModel, horizon: int, pad: float) -> Window:
+    """What `agent` can reach in `horizon` steps, and `pad` room units more on every side."""
     lower, upper = reach(agent, horizon)
     return Window(lower=jnp.asarray(lower - pad, float), upper=jnp.asarray(upper + pad, float))
 
 
-def _sample_speed(key: Array, speeds: Array) -> Array:
+def sample_speed(key: Array, speeds: Array) -> Array:
     """Half the time one of the reachable speeds, half the time any between the limits."""
     pick, grid, smooth = jax.random.split(key, 3)
     discrete = jax.random.choice(grid, speeds)
     continuous = jax.random.uniform(smooth, (), speeds.dtype, speeds[0], speeds[-1])
     return jnp.where(jax.random.bernoulli(pick), discrete, continuous)
-
-
-def _sample_relative(key: Array, window: Window) -> Array:
-    return jax.random.uniform(key, (2,), window.lower.dtype, window.lower, window.upper)
 
 
 class WallPoint(struct.PyTreeNode):
@@ -133,7 +165,7 @@ class WallPoint(struct.PyTreeNode):
     @classmethod
     def create(cls, agent: AgentModel, radius: float = 0.1, horizon: int = 5) -> "WallPoint":
         """With the window that `agent` can reach in `horizon` steps."""
-        window = _padded_window(agent, horizon, radius)
+        window = padded_window(agent, horizon, radius)
         return cls(radius=jnp.asarray(radius, float), window=window, horizon=horizon)
 
     def draw(self, key: Array, shape: tuple[int, ...] = ()) -> Array:
@@ -161,8 +193,8 @@ class WallPoint(struct.PyTreeNode):
     def sample(self, key: Array, agent: AgentModel) -> tuple[Vehicle, Array]:
         """See `HazardSource`."""
         where, fast = jax.random.split(key)
-        vehicle = make_vehicle(jnp.zeros(2), 0.0, _sample_speed(fast, agent.speeds))
-        return vehicle, _sample_relative(where, self.window)
+        vehicle = make_vehicle(jnp.zeros(2), 0.0, sample_speed(fast, agent.speeds))
+        return vehicle, self.window.sample(where)
 
     def state_of(self, features: Array) -> tuple[Vehicle, Array]:
         """See `HazardSource`."""
@@ -185,7 +217,7 @@ class Bomb(WallPoint):
         """With the window that `agent` can reach in `horizon` steps."""
         return cls(
             radius=jnp.asarray(radius, float),
-            window=_padded_window(agent, horizon, radius + ahead),
+            window=padded_window(agent, horizon, radius + ahead),
             horizon=horizon,
             ahead=jnp.asarray(ahead, float),
         )
@@ -258,7 +290,7 @@ class MovingObstacle(struct.PyTreeNode):
             distance=jnp.asarray(distance, float),
             speeds=jnp.asarray(speeds, float),
             behaviour=behaviour,
-            window=_padded_window(agent, horizon, pad),
+            window=padded_window(agent, horizon, pad),
             horizon=horizon,
         )
 
@@ -290,9 +322,9 @@ class MovingObstacle(struct.PyTreeNode):
         """See `HazardSource`."""
         where, turn, own, other = jax.random.split(key, 4)
         angle = jax.random.uniform(turn, (), float, -jnp.pi, jnp.pi)
-        position = _sample_relative(where, self.window)
-        hazard = make_vehicle(position, angle, _sample_speed(other, self.speeds))
-        return make_vehicle(jnp.zeros(2), 0.0, _sample_speed(own, agent.speeds)), hazard
+        position = self.window.sample(where)
+        hazard = make_vehicle(position, angle, sample_speed(other, self.speeds))
+        return make_vehicle(jnp.zeros(2), 0.0, sample_speed(own, agent.speeds)), hazard
 
     def state_of(self, features: Array) -> tuple[Vehicle, Vehicle]:
         """See `HazardSource`."""

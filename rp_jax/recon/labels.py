@@ -77,10 +77,7 @@ def monte_carlo_threat(
     noise = source.draw(theirs, (source.horizon, paths))
 
     def rollout(action: Any, controls: Any, noise: Any) -> Array:
-        def control(k: int, us: Any) -> Any:
-            return action if k == 0 else jax.tree.map(lambda c: c[k - 1], controls)
-
-        return _first_hit(agent, hazard, sub, control, noise)
+        return _first_hit(agent, hazard, sub, action, lambda _, control: control, controls, noise)
 
     over_actions = jax.vmap(rollout, (0, None, None))
     values = jax.vmap(over_actions, (None, 1, 1))(model.actions, controls, noise)  # (paths, A)
@@ -97,10 +94,9 @@ def plan_threat(key: Array, agent: Any, hazard: Any, sub: SubRMDP, paths: int = 
     noise = source.draw(key, (source.horizon, paths))
 
     def rollout(plan: Plans, action: Any, noise: Any) -> Array:
-        def control(k: int, us: Any) -> Any:
-            return action if k == 0 else plan.control(k - 1, us.speed)
-
-        return _first_hit(agent, hazard, sub, control, noise)
+        follow = lambda us, k: plan.control(k, us.speed)  # noqa: E731
+        steps = jnp.arange(source.horizon - 1)
+        return _first_hit(agent, hazard, sub, action, follow, steps, noise)
 
     plans = model.baseline
     over_actions = jax.vmap(rollout, (None, 0, None))
@@ -110,7 +106,13 @@ def plan_threat(key: Array, agent: Any, hazard: Any, sub: SubRMDP, paths: int = 
 
 
 def _first_hit(
-    agent: Any, hazard: Any, sub: SubRMDP, control: Callable[[int, Any], Any], noise: Any
+    agent: Any,
+    hazard: Any,
+    sub: SubRMDP,
+    action: Any,
+    policy: Callable[[Any, Any], Any],
+    inputs: Any,
+    noise: Any,
 ) -> Array:
     """() beta^K 1{K <= horizon} of one path.
 
@@ -118,21 +120,30 @@ def _first_hit(
         agent: its first state.
         hazard: its first state.
         sub: the sub-R-MDP.
-        control: from the step and the agent's state to its command.
+        action: the first control.
+        policy: every later one, from the agent's state and a row of `inputs`.
+        inputs: (horizon - 1, ...).
         noise: (horizon, ...) the hazard's random numbers.
     """
-    source, us, other = sub.source, agent, hazard
-    hit = source.hits(us, other)
-    value = jnp.where(hit, 1.0, 0.0)
-    weight = jnp.ones_like(value)
-    for k in range(source.horizon):
-        before, us = us, sub.agent.step(us, control(k, us))
-        other = source.step(other, before, jax.tree.map(lambda n, k=k: n[k], noise))
+    source = sub.source
+
+    def step(carry: Any, control: Any, noise: Any) -> Any:
+        us, other, hit, weight, value = carry
+        other = source.step(other, us, noise)
+        us = sub.agent.step(us, control)
         weight = weight * sub.beta
         now = source.hits(us, other) & ~hit
-        value = jnp.where(now, weight, value)
-        hit = hit | now
-    return value
+        return us, other, hit | now, weight, jnp.where(now, weight, value)
+
+    def onward(carry: Any, row: Any) -> tuple[Any, None]:
+        given, noise = row
+        return step(carry, policy(carry[0], given), noise), None
+
+    hit = source.hits(agent, hazard)
+    value = jnp.where(hit, 1.0, 0.0)
+    first, later = jax.tree.map(lambda n: n[0], noise), jax.tree.map(lambda n: n[1:], noise)
+    carry = step((agent, hazard, hit, jnp.ones_like(value), value), action, first)
+    return jax.lax.scan(onward, carry, (inputs, later))[0][-1]
 
 
 def _average(values: Array) -> Labels:
@@ -151,7 +162,7 @@ def leaves(sub: SubRMDP) -> int:
     assert isinstance(sub.agent.baseline, ControlDistribution)
     controls = len(sub.agent.baseline.probabilities)
     power = max(0, sub.source.horizon - 1 - sub.agent.delayed)
-    return len(sub.agent.actions.acceleration) * controls**power
+    return sub.agent.num_threats * controls**power
 
 
 def best_estimator(sub: SubRMDP, paths: int) -> Estimator:
