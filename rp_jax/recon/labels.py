@@ -13,7 +13,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
+from jax.sharding import Mesh
 
+from rp_jax import devices
 from rp_jax.hazards import SubRMDP
 from rp_jax.kinematics import ControlDistribution, Plans
 
@@ -183,12 +185,17 @@ def _sampled(estimator: Callable[..., Labels], paths: int) -> Estimator:
     return functools.partial(estimator, paths=paths)
 
 
-@functools.partial(jax.jit, static_argnames=("estimator", "batch"))
-def _label(key, agent, hazard, sub, estimator, batch):
+@functools.partial(jax.jit, static_argnames=("estimator", "batch", "mesh"))
+def _label(key, agent, hazard, sub, estimator, batch, mesh):
+    def several(keys, agent, hazard, sub):
+        one = lambda row: estimator(*row, sub)  # noqa: E731
+        return jax.lax.map(one, (keys, agent, hazard), batch_size=batch)
+
     count = jax.tree.leaves(agent)[0].shape[0]
     keys = jax.random.split(key, count)
-    one = lambda row: estimator(*row, sub)  # noqa: E731
-    return jax.lax.map(one, (keys, agent, hazard), batch_size=batch)
+    if mesh is not None:
+        several = devices.share_out(several, (0, 0, 0, None), mesh)
+    return several(keys, agent, hazard, sub)
 
 
 def label(
@@ -201,6 +208,7 @@ def label(
     batch: int = 32,
     rows: int = 8192,
     on_progress: Callable[[int, int], None] | None = None,
+    mesh: Mesh | None = None,
 ) -> Labels:
     """Labels many states, leading axis (n,), `rows` to a call and `batch` side by side.
 
@@ -213,15 +221,19 @@ def label(
         batch: rows simulated at once; bounds the memory.
         rows: rows between two reports of progress.
         on_progress: called with (rows done, n).
+        mesh: of devices that share the rows; None for one device.
     """
     count = jax.tree.leaves(agent)[0].shape[0]
+    rows = min(rows, count)
+    rows += 0 if mesh is None else -rows % mesh.size
     parts = []
     for start in range(0, count, rows):
         # The last call repeats rows, so that there is one shape and one compilation.
-        index = jnp.minimum(start + jnp.arange(min(rows, count)), count - 1)
+        index = jnp.minimum(start + jnp.arange(rows), count - 1)
         take = lambda tree, index=index: jax.tree.map(lambda a: a[index], tree)  # noqa: E731
         chunk = jax.random.fold_in(key, start)
-        parts.append(_label(chunk, take(agent), take(hazard), sub, estimator, batch))
+        found = _label(chunk, take(agent), take(hazard), sub, estimator, batch, mesh)
+        parts.append(devices.gather(found, mesh))
         if on_progress:
             jax.block_until_ready(parts[-1])
             on_progress(min(start + rows, count), count)
