@@ -30,9 +30,12 @@ def connect(devices: str) -> None:
     """
     if devices != "cluster" or jax.distributed.is_initialized():
         return
-    told = {name: os.environ.get(f"JAX_{name.upper()}") for name in ("num_processes", "process_id")}
+    count, number = (os.environ.get(name) for name in ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID"))
     try:
-        jax.distributed.initialize(**{name: int(v) for name, v in told.items() if v})
+        jax.distributed.initialize(
+            num_processes=int(count) if count else None,
+            process_id=int(number) if number else None,
+        )
     except (RuntimeError, ValueError) as error:
         raise ValueError(
             f"devices is 'cluster'; it must be started by a cluster's launcher, or with "

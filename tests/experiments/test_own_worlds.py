@@ -21,7 +21,8 @@ ROOT = Path(__file__).parents[2]
 
 
 def flush_left(text):
-    return re.sub(r"^ +", "", text, flags=re.MULTILINE)
+    """Without indentation and empty lines."""
+    return re.sub(r"^\s+", "", text, flags=re.MULTILINE)
 
 
 def test_the_page_shows_the_code_that_is_tested():
