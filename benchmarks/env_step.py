@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks.measure import Row, main, measure
-from rp_jax.envs import base, circuit, jam
+from rp_jax.envs import base, circuit, jam, point_gather
 
 STEPS = 100
 
@@ -34,8 +34,9 @@ def steps(env, observed: bool):
 
 
 def run(batch: int = 1024) -> list[Row]:
-    """Circuit, and Jam among 3, 8, 15 and 50 obstacles."""
+    """Circuit, Point Gather, and Jam among 3, 8, 15 and 50 obstacles."""
     cases: list[tuple[str, Any, Any]] = [("circuit", circuit, circuit.make_params())]
+    cases.append(("point_gather", point_gather, point_gather.make_params()))
     cases += [(f"jam N={n}", jam, jam.make_params(n)) for n in (3, 8, 15, 50)]
     rows = []
     for name, env, params in cases:

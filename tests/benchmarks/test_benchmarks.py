@@ -11,7 +11,9 @@ from quick import unoptimised
 
 from benchmarks import adapters, env_step, measure, recon, setups, tabular, threat_query, train_step
 from benchmarks.measure import Row
-from experiments import circuit, jam
+from experiments import circuit, jam, point_gather
+
+MODULES = {"circuit": circuit, "jam": jam, "point_gather": point_gather}
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -96,9 +98,9 @@ def test_the_program_of_steps_takes_them(observed):
 
 
 def tiny_tasks():
-    """Both tasks with networks and batches as small as they may be."""
+    """All tasks with networks and batches as small as they may be."""
     found = {}
-    for name, module in (("circuit", circuit), ("jam", jam)):
+    for name, module in MODULES.items():
         config = module.quick("tuned")
         small = lambda threat: dataclasses.replace(  # noqa: E731
             threat, fit=dataclasses.replace(threat.fit, hidden=(4,), batch=16)
@@ -114,8 +116,8 @@ def tiny_tasks():
 
 def test_the_setups_are_the_tuned_recipes():
     found = setups.tasks()
-    assert set(found) == {"circuit", "jam"}
-    for module in (circuit, jam):
+    assert set(found) == set(MODULES)
+    for module in MODULES.values():
         task, config = found[module.__name__.split(".")[-1]]
         assert config == module.quick("tuned")
         assert set(task.threats) == set(task.env.sub_rmdps(task.train))
@@ -126,8 +128,8 @@ def test_training_is_measured(monkeypatch):
     monkeypatch.setattr(train_step, "tasks", tiny_tasks)
     monkeypatch.setattr(train_step, "ITERATIONS", 2)
     rows = [sane(row) for row in train_step.run()]
-    assert [row.batch for row in rows] == [4, 4]
-    assert [row.name.split(",")[0] for row in rows] == ["circuit", "jam"]
+    assert [row.batch for row in rows] == [4] * len(MODULES)
+    assert [row.name.split(",")[0] for row in rows] == list(MODULES)
 
 
 @pytest.mark.slow
@@ -135,7 +137,7 @@ def test_threat_queries_are_measured(monkeypatch):
     monkeypatch.setattr(threat_query, "tasks", tiny_tasks)
     rows = [sane(row) for row in threat_query.run((1, 4))]
     assert [(row.name, row.batch) for row in rows] == [
-        (name, batch) for name in ("circuit", "jam") for batch in (1, 4)
+        (name, batch) for name in MODULES for batch in (1, 4)
     ]
 
 
@@ -149,7 +151,7 @@ def test_reconnaissance_is_measured(monkeypatch):
 @pytest.mark.slow
 def test_environments_are_measured():
     rows = [sane(row) for row in env_step.run(4)]
-    assert len({row.name for row in rows}) == len(rows) == 10
+    assert len({row.name for row in rows}) == len(rows) == 12
 
 
 def test_solving_cmdps_is_measured_beside_a_linear_program():
