@@ -9,15 +9,16 @@ from benchmarks.bound import Piece
 from experiments import circuit as circuit_experiment
 from experiments import jam as jam_experiment
 from experiments import pipeline
+from experiments import point_gather as point_gather_experiment
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.recon import sampling
 from rp_jax.threat import fit, total
 
 
 def tasks() -> dict[str, tuple[pipeline.Task, pipeline.Config]]:
-    """The two tasks with their quick settings."""
+    """The tasks with their quick settings."""
     found = {}
-    for module in (circuit_experiment, jam_experiment):
+    for module in (circuit_experiment, jam_experiment, point_gather_experiment):
         config = module.quick("tuned")
         task = module.make_task(config)
         found[task.name] = (task, config)
@@ -31,7 +32,7 @@ def pmdp_of(task: pipeline.Task, config: pipeline.Config) -> PMDP:
     for kind, sub in task.env.sub_rmdps(task.train).items():
         features = sampling.uniform(jax.random.key(1), sub, 1000)
         inside = jnp.linalg.norm(features[:, :2], axis=-1) < 0.25
-        threat = jnp.repeat(inside[:, None].astype(jnp.float32), 15, axis=1)
+        threat = jnp.repeat(inside[:, None].astype(jnp.float32), sub.agent.num_threats, axis=1)
         data = fit.Dataset(features, threat)
         settings = task.threats[kind].fit
         model, state = fit.init(jax.random.key(2), sub, data, settings)

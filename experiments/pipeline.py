@@ -2,7 +2,9 @@
 
 import dataclasses
 import datetime
+import functools
 import json
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +17,7 @@ import numpy as np
 
 import rp_jax
 from experiments import console, tables
-from rp_jax import evaluate, shield, storage
+from rp_jax import devices, evaluate, shield, storage
 from rp_jax.envs.base import BASELINES, Env
 from rp_jax.planning import loop
 from rp_jax.planning.loop import LoopConfig
@@ -45,6 +47,7 @@ class Config:
     learning_toll: float = 0.0  # likewise, per state without an admissible action
     penalty: float = 50.0  # taken off the return per unit of danger in the tables
     episodes: int = 10_000  # evaluated per case
+    devices: str = "one"  # "all": seeds side by side on every device; "cluster": of every process
     figures: bool = True  # draw figures and an animation
     planning: LoopConfig = field(default_factory=LoopConfig)  # the learner
     fidelity: str = "released"  # "released" as the published numbers, "paper" as the text
@@ -59,6 +62,7 @@ class Config:
         number("learning_toll", self.learning_toll, least=0)
         number("penalty", self.penalty, least=0)
         number("episodes", self.episodes, least=1, integer=True)
+        one_of("devices", self.devices, devices.DEVICES)
         one_of("fidelity", self.fidelity, ("released", "paper"))
         one_of("baseline", self.baseline, BASELINES)
         self.planning.validate("planning")
@@ -133,10 +137,13 @@ def learn_threats(task: Task, config: Config, folder: Path) -> tuple[dict | None
     keys = jax.random.split(key_of(config.seed, THREAT), len(subs))
     for key, kind in zip(keys, sorted(subs), strict=True):
         with console.progress(f"threat of {kind}") as bar:
-            built[kind] = build.build(key, subs[kind], task.threats[kind], config.x, bar)
+            built[kind] = build.build(
+                key, subs[kind], task.threats[kind], config.x, bar, devices.mesh_of(config.devices)
+            )
     models = {kind: b.model for kind, b in built.items()}
     reports = {kind: b.report for kind, b in built.items()}
     timings = {kind: b.seconds for kind, b in built.items()}
+    models = devices.agreed(models)
     sums = sum_reports(key_of(config.seed, SUMS), task, config, models)
     curves = {kind: b.curve for kind, b in built.items()}
     about = {
@@ -232,23 +239,27 @@ def plan(
         f"replayed per step, {'; '.join(methods)}"
     )
     pmdp, axes = side_by_side(pmdp, members)
+    mesh = devices.mesh_of(config.devices)
+    keys, pmdp = devices.place((keys, pmdp), (0, axes), mesh)
     history: list[dict[str, Any]] = []
     with console.progress("planning") as bar:
         bar("", 0, chunks, "compiling")
         began = time.perf_counter()
-        init = jax.jit(jax.vmap(loop.init, (0, axes, None)), static_argnums=2)
-        start = init.lower(keys, pmdp, planning).compile()
-        chunk = jax.jit(
-            jax.vmap(loop.chunk, (0, axes, None, None)), static_argnums=(2, 3), donate_argnums=0
-        )
-        shapes, _ = jax.eval_shape(init, keys, pmdp, planning)
-        step = chunk.lower(shapes, pmdp, planning, length).compile()
+        begin = functools.partial(loop.init, config=planning)
+        init = jax.jit(devices.spread(begin, (0, axes), mesh))
+        start = init.lower(keys, pmdp).compile()
+        onward = functools.partial(loop.chunk, config=planning, iterations=length)
+        chunk = jax.jit(devices.spread(onward, (0, axes), mesh), donate_argnums=0)
+        shapes, _ = jax.eval_shape(init, keys, pmdp)
+        step = chunk.lower(devices.placed(shapes, mesh), pmdp).compile()
         compiled = time.perf_counter()
         state, metrics = start(keys, pmdp)
         for i in range(chunks):
             state, new = step(state, pmdp)
             metrics = jax.tree.map(jnp.add, metrics, new) if i == 0 else new
-            rows = _chunk_rows(metrics, config, members, length * planning.updates, history)
+            rows = _chunk_rows(
+                devices.gather(metrics, mesh), config, members, length * planning.updates, history
+            )
             history += rows
             seconds = time.perf_counter() - compiled
             for row in rows:
@@ -256,8 +267,9 @@ def plan(
             _append_lines(folder / "metrics.jsonl", rows)
             bar("", i + 1, chunks, _note(rows))
     about = {"methods": methods, "members": [member._asdict() for member in members]}
-    storage.save(folder / "agent", "Q-network", state.learner.params, about)
-    return Trained(state.learner.params, history, seconds, compiled - began)
+    params = devices.gather(state.learner.params, mesh)
+    storage.save(folder / "agent", "Q-network", params, about)
+    return Trained(params, history, seconds, compiled - began)
 
 
 def _chunk_rows(
@@ -314,14 +326,16 @@ def evaluate_all(
         values = evaluate.greedy(network, params)
         return evaluate.run_episodes(key, pmdp, values, config.episodes, batch=batch)
 
-    everyone = jax.jit(jax.vmap(one, (0, 0, axes)))
+    mesh, places = devices.mesh_of(config.devices), (0, 0, axes)
+    everyone = jax.jit(devices.spread(one, places, mesh))
     keys = keys_of(members, EVALUATION)
     rows = []
     with console.progress("evaluation") as bar:
         for done, (variant, params) in enumerate(task.tests.items()):
             bar("", done, len(task.tests), f"{variant}: {config.episodes:,} episodes a seed")
             this = pmdp.replace(params=params)
-            episodes = jax.tree.map(np.asarray, everyone(keys, trained.params, this))
+            given = devices.place((keys, trained.params, this), places, mesh)
+            episodes = jax.tree.map(np.asarray, devices.gather(everyone(*given), mesh))
             first = jax.tree.map(lambda a: a[0], trained.params)
             seconds = action_seconds(this.replace(x=this.x[0]), network, first)
             for i, member in enumerate(members):
@@ -376,11 +390,15 @@ def prepare(make_task: Callable[[Any], Task], config: Config, preset: str) -> tu
         ValueError: a setting is out of range, or a file cannot be used.
     """
     config.validate()
+    devices.connect(config.devices)
+    devices.divides("seeds", config.seeds, devices.mesh_of(config.devices))
     task = make_task(config)
     for kind, threat in task.threats.items():
         threat.validate(kind)
     if config.threat is not None:
         artefact.load(config.threat, task.name, task.env.sub_rmdps(task.train))
+    if not devices.is_first():  # what the others write is thrown away
+        return task, Path(tempfile.mkdtemp())
     return task, storage.new_folder(config.out or default_out(task.name, preset))
 
 

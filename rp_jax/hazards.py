@@ -21,6 +21,37 @@ from rp_jax.kinematics import (
 )
 
 
+class Agent(Protocol):
+    """Whoever acts: `kinematics.AgentModel`, or a body of any simulator.
+
+    States and controls are pytrees of its own; the methods are unbatched.
+    """
+
+    actions: Any  # table of controls, leading axis (A,)
+    baseline: Any  # eta^(o): a ControlDistribution over such controls, or Plans
+
+    @property
+    def num_threats(self) -> int:
+        """Threats of a state: A of them under one baseline policy."""
+
+    @property
+    def delayed(self) -> bool:
+        """Whether a control moves the agent one step later only."""
+
+    def control(self, action: Array) -> Any:
+        """The command of an action."""
+
+    def step(self, agent: Any, control: Any) -> Any:
+        """The agent's next state, p(s_o' | s_o, a)."""
+
+    def mirrored_threats(self) -> np.ndarray:
+        """(num_threats,) index of each action's left-right mirror image.
+
+        Where there is no such symmetry, `np.arange(num_threats)`; then `HazardSource.mirrored`
+        must return its argument.
+        """
+
+
 class HazardSource(Protocol):
     """One kind of event: how its hazards move, when they strike, how a model sees them.
 
@@ -57,7 +88,7 @@ class HazardSource(Protocol):
     def mirrored(self, features: Array) -> Array:
         """`features` (..., F) of the left-right mirrored situation."""
 
-    def sample(self, key: Array, agent: AgentModel) -> tuple[Any, Any]:
+    def sample(self, key: Array, agent: Any) -> tuple[Any, Any]:
         """An (agent, hazard) pair drawn over what is `in_reach`, every speed included."""
 
     def state_of(self, features: Array) -> tuple[Any, Any]:
@@ -76,6 +107,10 @@ class Window(struct.PyTreeNode):
         outside = (x < self.lower[0]) | (x > self.upper[0])
         return ~(outside | (y < self.lower[1]) | (y > self.upper[1]))
 
+    def sample(self, key: Array) -> Array:
+        """(2,) a relative position, uniform over the box."""
+        return jax.random.uniform(key, (2,), self.lower.dtype, self.lower, self.upper)
+
     def padded(self, pad: Array) -> "Window":
         """Wider by `pad` () on every side."""
         return Window(self.lower - pad, self.upper + pad)
@@ -84,7 +119,7 @@ class Window(struct.PyTreeNode):
 class SubRMDP(struct.PyTreeNode):
     """The R-MDP of a single hazard: Algorithm 2, line 2, estimates its threat function."""
 
-    agent: AgentModel
+    agent: Any  # an Agent
     source: Any  # a HazardSource
     beta: Array | float = 0.999  # discount of danger
 
@@ -129,16 +164,18 @@ class Reach(struct.PyTreeNode):
 MARGIN = 1e-5  # room units by which windows are too wide, for rounding
 
 
-def _sample_speed(key: Array, speeds: Array) -> Array:
+def padded_window(agent: AgentModel, horizon: int, pad: float) -> Window:
+    """What `agent` may come by in `horizon` steps at any speed, and `pad` room units around it."""
+    reach = Reach.create(agent, horizon)
+    return _union(*map(reach.box, reach.limits)).padded(jnp.asarray(pad))
+
+
+def sample_speed(key: Array, speeds: Array) -> Array:
     """Half the time one of the reachable speeds, half the time any between the limits."""
     pick, grid, smooth = jax.random.split(key, 3)
     discrete = jax.random.choice(grid, speeds)
     continuous = jax.random.uniform(smooth, (), speeds.dtype, speeds[0], speeds[-1])
     return jnp.where(jax.random.bernoulli(pick), discrete, continuous)
-
-
-def _sample_relative(key: Array, window: Window) -> Array:
-    return jax.random.uniform(key, (2,), window.lower.dtype, window.lower, window.upper)
 
 
 def _union(one: Window, other: Window) -> Window:
@@ -198,8 +235,8 @@ class WallPoint(struct.PyTreeNode):
     def sample(self, key: Array, agent: AgentModel) -> tuple[Vehicle, Array]:
         """See `HazardSource`."""
         where, fast = jax.random.split(key)
-        vehicle = make_vehicle(jnp.zeros(2), 0.0, _sample_speed(fast, agent.speeds))
-        return vehicle, _sample_relative(where, self.window_at(vehicle.speed))
+        vehicle = make_vehicle(jnp.zeros(2), 0.0, sample_speed(fast, agent.speeds))
+        return vehicle, self.window_at(vehicle.speed).sample(where)
 
     def state_of(self, features: Array) -> tuple[Vehicle, Array]:
         """See `HazardSource`."""
@@ -350,8 +387,8 @@ class MovingObstacle(struct.PyTreeNode):
         """See `HazardSource`."""
         where, turn, own, other = jax.random.split(key, 4)
         angle = jax.random.uniform(turn, (), float, -jnp.pi, jnp.pi)
-        speed, faster = _sample_speed(own, agent.speeds), _sample_speed(other, self.speeds)
-        position = _sample_relative(where, self.window_at(speed, faster))
+        speed, faster = sample_speed(own, agent.speeds), sample_speed(other, self.speeds)
+        position = self.window_at(speed, faster).sample(where)
         return make_vehicle(jnp.zeros(2), 0.0, speed), make_vehicle(position, angle, faster)
 
     def state_of(self, features: Array) -> tuple[Vehicle, Vehicle]:

@@ -1,6 +1,7 @@
 """Vehicle dynamics: the only copy, shared by agents, moving obstacles, rollouts and adapters."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +28,7 @@ class Vehicle(struct.PyTreeNode):
 class ControlDistribution(struct.PyTreeNode):
     """A state-independent random policy over a table of controls (an open-loop eta^(o))."""
 
-    controls: Control  # (K,) table
+    controls: Any  # (K,) table, of a `Control` or of what else an agent takes
     probabilities: Array  # (K,) sums to one
 
     @property
@@ -40,7 +41,7 @@ class ControlDistribution(struct.PyTreeNode):
         """() greatest change of speed in a step."""
         return jnp.max(jnp.abs(self.controls.acceleration))
 
-    def sample(self, key: Array, shape: tuple[int, ...] = ()) -> Control:
+    def sample(self, key: Array, shape: tuple[int, ...] = ()) -> Any:
         """Draws controls of the given shape, by inverting the cumulative distribution."""
         uniform = jax.random.uniform(key, shape, self.probabilities.dtype)
         edges = jnp.cumsum(self.probabilities)[:-1]
@@ -148,6 +149,22 @@ class AgentModel(struct.PyTreeNode):
             return moved
         return moved.replace(position=jnp.clip(moved.position, -self.room, self.room))
 
+    def mirrored_threats(self) -> np.ndarray:
+        """(num_threats,) index of the mirror image of each plan and action.
+
+        Raises:
+            ValueError: the actions, or the plans, have no such symmetry.
+        """
+        actions = mirrored_actions(self.actions)
+        if not isinstance(self.baseline, Plans):
+            return actions
+        plans, count = self.baseline, len(actions)
+        columns = [plans.rotation, plans.target[:, None], plans.steps[:, None]]
+        table = np.concatenate([np.asarray(c) for c in columns], axis=-1)
+        missing = "baseline: there is no mirror image of some of the plans"
+        images = mirror_images(table, [1, -1, 1, 1], missing)
+        return (images[:, None] * count + actions[None]).ravel()
+
 
 def make_vehicle(position, heading, speed) -> Vehicle:
     """Builds a `Vehicle` from a position (..., 2), a heading angle (...) in radians and a speed."""
@@ -190,34 +207,21 @@ def mirrored_actions(actions: Control) -> np.ndarray:
     """
     acceleration, rotation = np.asarray(actions.acceleration), np.asarray(actions.rotation)
     table = np.concatenate([acceleration[:, None], rotation], axis=-1)
-    return _images(
+    return mirror_images(
         table, [1, 1, -1], "actions: the table holds no mirror image of some of its actions"
     )
 
 
-def _images(table: np.ndarray, signs: Sequence[int], missing: str) -> np.ndarray:
-    """(n,) index of the row that each row (n, F) becomes under the signs of its columns."""
+def mirror_images(table: np.ndarray, signs: Sequence[int], missing: str) -> np.ndarray:
+    """(n,) index of the row that each row (n, F) becomes under the signs of its columns.
+
+    Raises:
+        ValueError: one becomes none of them; the message is `missing`.
+    """
     gap = np.abs(table[:, None] - table[None] * np.asarray(signs)).max(axis=-1)
     if (gap.min(axis=-1) > 1e-6).any():
         raise ValueError(missing)
     return gap.argmin(axis=-1)
-
-
-def mirrored_threats(agent: AgentModel) -> np.ndarray:
-    """(num_threats,) index of the mirror image of each plan and action.
-
-    Raises:
-        ValueError: the actions, or the plans, have no such symmetry.
-    """
-    actions = mirrored_actions(agent.actions)
-    if not isinstance(agent.baseline, Plans):
-        return actions
-    plans, count = agent.baseline, len(actions)
-    columns = [plans.rotation, plans.target[:, None], plans.steps[:, None]]
-    table = np.concatenate([np.asarray(c) for c in columns], axis=-1)
-    missing = "baseline: there is no mirror image of some of the plans"
-    images = _images(table, [1, -1, 1, 1], missing)
-    return (images[:, None] * count + actions[None]).ravel()
 
 
 def rotate(vector: Array, rotation: Array) -> Array:

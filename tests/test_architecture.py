@@ -13,7 +13,7 @@ FOREIGN = ("brax", "matplotlib", "gymnasium")
 # From the left to the right, as data flow: each imports only from parts to its left, and parts of
 # one place in the line not from one another.
 ORDER = [
-    {"validate", "storage", "kinematics"},
+    {"validate", "storage", "devices", "kinematics"},
     {"sensing", "statistics", "shield"},
     {"hazards"},
     {"envs"},
@@ -89,9 +89,12 @@ def test_libraries_for_show_are_imported_at_the_rim_only(name):
         assert used.isdisjoint({*FOREIGN, "experiments", "benchmarks", "rich", "tyro", "mujoco"})
 
 
-@pytest.mark.parametrize("package", ["rp_jax", "experiments", "benchmarks"])
+@pytest.mark.parametrize("package", ["rp_jax", "experiments", "examples", "benchmarks"])
 def test_nothing_imports_what_stands_above_it(package):
-    above = {"rp_jax": {"experiments", "benchmarks"}, "experiments": {"benchmarks"}}
+    above = {
+        "rp_jax": {"experiments", "examples", "benchmarks"},
+        "experiments": {"examples", "benchmarks"},
+    }
     for name, tree in modules(package).items():
         used = {imported.split(".")[0] for imported in imports(tree)}
         assert used.isdisjoint({"tests", *above.get(package, ())}), name
@@ -112,14 +115,24 @@ def test_importing_the_core_loads_none_of_them():
     assert run("\n".join(lines)) == []
 
 
-@pytest.mark.parametrize(("adapter", "library"), [("brax", "brax"), ("gymnasium", "gymnasium")])
-def test_each_adapter_alone_imports_its_library(adapter, library):
+ADAPTERS = {"brax": ["brax", "physics"], "gymnasium": ["gymnasium"]}
+
+
+@pytest.mark.parametrize("library", ADAPTERS)
+def test_adapters_alone_import_their_library(library):
     users = {
         name
         for name, tree in modules().items()
         if library in {imported.split(".")[0] for imported in imports(tree)}
     }
-    assert users == {f"rp_jax.adapters.{adapter}"}
+    assert users == {f"rp_jax.adapters.{adapter}" for adapter in ADAPTERS[library]}
+
+
+@pytest.mark.parametrize(
+    ("adapter", "library"),
+    [(adapter, library) for library, adapters in ADAPTERS.items() for adapter in adapters],
+)
+def test_an_adapter_loads_its_own_library_only(adapter, library):
     others = [name for name in FOREIGN if name != library]
     loaded = f"print(*[m for m in {others!r} if m in sys.modules])"
     assert run(f"import rp_jax.adapters.{adapter}, sys; {loaded}") == []  # nor is it noisy
@@ -127,13 +140,17 @@ def test_each_adapter_alone_imports_its_library(adapter, library):
 
 
 @pytest.mark.parametrize(
-    ("adapter", "advice"),
-    [("brax", "pip install brax"), ("gymnasium", r"pip install 'rp_jax[gymnasium]'")],
+    ("adapter", "library", "advice"),
+    [
+        ("brax", "brax", "pip install brax"),
+        ("physics", "brax", "pip install brax"),
+        ("gymnasium", "gymnasium", r"pip install 'rp_jax[gymnasium]'"),
+    ],
 )
-def test_without_its_library_an_adapter_says_what_to_install(adapter, advice):
+def test_without_its_library_an_adapter_says_what_to_install(adapter, library, advice):
     lines = [
         "import sys",
-        f"sys.modules[{adapter!r}] = None",
+        f"sys.modules[{library!r}] = None",
         "try:",
         f"    import rp_jax.adapters.{adapter}",
         "except ImportError as error:",
@@ -181,7 +198,7 @@ def undocumented(tree):
     return list(visit(tree, ""))
 
 
-@pytest.mark.parametrize("package", ["rp_jax", "experiments", "benchmarks"])
+@pytest.mark.parametrize("package", ["rp_jax", "experiments", "examples", "benchmarks"])
 def test_all_that_is_public_is_documented(package):
     missing = {name: undocumented(tree) for name, tree in modules(package).items()}
     assert {name: found for name, found in missing.items() if found} == {}

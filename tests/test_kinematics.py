@@ -19,7 +19,6 @@ from rp_jax.kinematics import (
     make_plans,
     make_vehicle,
     mirrored_actions,
-    mirrored_threats,
     rotate,
     squared_distance,
     to_ego,
@@ -227,7 +226,7 @@ def test_every_plan_goes_to_its_target_and_then_to_a_halt(k, speed):
 @pytest.mark.parametrize("baseline", ["paper", "plans"])
 def test_mirrored_threats_swap_the_turns_of_plan_and_action(baseline):
     agent = jam.make_params(1, baseline=baseline).agent
-    order = mirrored_threats(agent)
+    order = agent.mirrored_threats()
     assert len(order) == agent.num_threats == (15 if baseline == "paper" else 135)
     np.testing.assert_array_equal(order[order], np.arange(len(order)))
     if baseline == "plans":
@@ -240,7 +239,7 @@ def test_mirrored_threats_are_refused_where_a_plan_has_no_mirror_image():
     agent = jam.make_params(1, baseline="plans").agent
     lopsided = make_plans((0.0, 0.3), (), 0, 0.02, 0.1)
     with pytest.raises(ValueError, match="baseline: there is no mirror image"):
-        mirrored_threats(agent.replace(baseline=lopsided))
+        agent.replace(baseline=lopsided).mirrored_threats()
 
 
 def test_a_point_changes_first_then_moves_and_stands_still_again():

@@ -3,10 +3,7 @@
 Importing this module registers every environment: `brax.envs.get_environment("rp_jax_jam")`.
 """
 
-import contextlib
 import functools
-import io
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -17,17 +14,13 @@ from jax import Array
 
 from rp_jax import shield
 from rp_jax.adapters import registry
+from rp_jax.adapters.quiet import quietly
 from rp_jax.envs import base
 
-# brax prints which of its physics engines are missing, and a library of its warns of its own age.
-with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
-    warnings.simplefilter("ignore", DeprecationWarning)
-    try:
-        from brax import envs
-        from brax.envs.base import Env, State, Wrapper
-        from brax.envs.wrappers import training
-    except ImportError as error:
-        raise ImportError("rp_jax.adapters.brax needs brax (pip install brax)") from error
+with quietly():
+    from brax import envs
+    from brax.envs.base import Env, State, Wrapper
+    from brax.envs.wrappers import training
 
 
 def _typed(key: Array) -> Array:

@@ -65,6 +65,38 @@ def learning_curves(history: Sequence[Mapping[str, Any]], title: str, path: Path
     plt.close(figure)
 
 
+def methods(history: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
+    """Return and crash rate while learning, a line per method; seeds taken together.
+
+    Args:
+        history: one row per chunk, method and seed, as in metrics.jsonl.
+        title: of the figure.
+        path: of the PNG.
+    """
+    figure, axes = plt.subplots(2, 1, figsize=(7, 5.5), sharex=True, layout="constrained")
+    names = dict.fromkeys(row["method"] for row in history)
+    for colour, name in zip((GREY, RED, BLUE), names, strict=False):
+        of = [row for row in history if row["method"] == name and row["episodes"]]
+        steps = sorted({row["steps"] for row in of})
+        groups = [[row for row in of if row["steps"] == s] for s in steps]
+        returns = [np.mean([row["return_mean"] for row in group]) for group in groups]
+        axes[0].plot(steps, returns, color=colour, label=name)
+        counts = [[sum(r[k] for r in g) for k in ("crashes", "episodes")] for g in groups]
+        axes[1].plot(steps, [100 * k / n for k, n in counts], color=colour)
+        bounds = np.asarray([statistics.clopper_pearson(k, n) for k, n in counts])
+        axes[1].fill_between(steps, *(100 * bounds).T, color=colour, alpha=0.2, linewidth=0)
+    axes[0].set_ylabel("return while exploring\n(crash penalty included)")
+    axes[1].set_ylabel("episodes with a crash, %\n(shaded: 95 % Clopper-Pearson)")
+    axes[1].set_xlabel("agent steps")
+    axes[1].set_ylim(bottom=0)
+    axes[0].legend()
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    figure.suptitle(title)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
 def frontier(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Return and crash rate over the threshold, with 95 % intervals, a column per variant.
 

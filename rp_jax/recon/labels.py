@@ -13,9 +13,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
+from jax.sharding import Mesh
 
+from rp_jax import devices
 from rp_jax.hazards import SubRMDP
-from rp_jax.kinematics import ControlDistribution, Plans
+from rp_jax.kinematics import AgentModel, ControlDistribution, Plans
 
 
 class Labels(struct.PyTreeNode):
@@ -83,12 +85,13 @@ def monte_carlo_threat(
     ours, theirs = jax.random.split(key)
     controls = model.baseline.sample(ours, (source.horizon - 1, paths))
     noise = source.draw(theirs, (source.horizon, paths))
+    # Unrolled, a vehicle's steps become one loop over the paths; a simulated body's would take
+    # minutes to compile.
+    unroll = isinstance(model, AgentModel)
 
     def rollout(action: Any, controls: Any, noise: Any) -> Array:
-        def control(k: int, us: Any) -> Any:
-            return action if k == 0 else jax.tree.map(lambda c: c[k - 1], controls)
-
-        return _first_hit(agent, hazard, sub, control, noise)
+        given = lambda _, control: control  # noqa: E731
+        return _first_hit(agent, hazard, sub, action, given, controls, noise, unroll)
 
     over_actions = jax.vmap(rollout, (0, None, None))
     values = jax.vmap(over_actions, (None, 1, 1))(model.actions, controls, noise)  # (paths, A)
@@ -105,10 +108,9 @@ def plan_threat(key: Array, agent: Any, hazard: Any, sub: SubRMDP, paths: int = 
     noise = source.draw(key, (source.horizon, paths))
 
     def rollout(plan: Plans, action: Any, noise: Any) -> Array:
-        def control(k: int, us: Any) -> Any:
-            return action if k == 0 else plan.control(k - 1, us.speed)
-
-        return _first_hit(agent, hazard, sub, control, noise)
+        follow = lambda us, k: plan.control(k, us.speed)  # noqa: E731
+        steps = jnp.arange(source.horizon - 1)
+        return _first_hit(agent, hazard, sub, action, follow, steps, noise)
 
     plans = model.baseline
     over_actions = jax.vmap(rollout, (None, 0, None))
@@ -118,7 +120,14 @@ def plan_threat(key: Array, agent: Any, hazard: Any, sub: SubRMDP, paths: int = 
 
 
 def _first_hit(
-    agent: Any, hazard: Any, sub: SubRMDP, control: Callable[[int, Any], Any], noise: Any
+    agent: Any,
+    hazard: Any,
+    sub: SubRMDP,
+    action: Any,
+    policy: Callable[[Any, Any], Any],
+    inputs: Any,
+    noise: Any,
+    unroll: bool = False,
 ) -> Array:
     """() beta^K 1{K <= horizon} of one path.
 
@@ -126,21 +135,31 @@ def _first_hit(
         agent: its first state.
         hazard: its first state.
         sub: the sub-R-MDP.
-        control: from the step and the agent's state to its command.
+        action: the first control.
+        policy: every later one, from the agent's state and a row of `inputs`.
+        inputs: (horizon - 1, ...).
         noise: (horizon, ...) the hazard's random numbers.
+        unroll: compile the steps one after another, not as a loop.
     """
-    source, us, other = sub.source, agent, hazard
-    hit = source.hits(us, other)
-    value = jnp.where(hit, 1.0, 0.0)
-    weight = jnp.ones_like(value)
-    for k in range(source.horizon):
-        before, us = us, sub.agent.step(us, control(k, us))
-        other = source.step(other, before, jax.tree.map(lambda n, k=k: n[k], noise))
+    source = sub.source
+
+    def step(carry: Any, control: Any, noise: Any) -> Any:
+        us, other, hit, weight, value = carry
+        other = source.step(other, us, noise)
+        us = sub.agent.step(us, control)
         weight = weight * sub.beta
         now = source.hits(us, other) & ~hit
-        value = jnp.where(now, weight, value)
-        hit = hit | now
-    return value
+        return us, other, hit | now, weight, jnp.where(now, weight, value)
+
+    def onward(carry: Any, row: Any) -> tuple[Any, None]:
+        given, noise = row
+        return step(carry, policy(carry[0], given), noise), None
+
+    hit = source.hits(agent, hazard)
+    value = jnp.where(hit, 1.0, 0.0)
+    first, later = jax.tree.map(lambda n: n[0], noise), jax.tree.map(lambda n: n[1:], noise)
+    carry = step((agent, hazard, hit, jnp.ones_like(value), value), action, first)
+    return jax.lax.scan(onward, carry, (inputs, later), unroll=unroll)[0][-1]
 
 
 def _average(values: Array) -> Labels:
@@ -160,7 +179,7 @@ def leaves(sub: SubRMDP) -> int:
     assert isinstance(sub.agent.baseline, ControlDistribution)
     controls = len(sub.agent.baseline.probabilities)
     power = max(0, sub.source.horizon - 1 - sub.agent.delayed)
-    return len(sub.agent.actions.acceleration) * controls**power
+    return sub.agent.num_threats * controls**power
 
 
 def best_estimator(sub: SubRMDP, paths: int) -> Estimator:
@@ -181,12 +200,17 @@ def _sampled(estimator: Callable[..., Labels], paths: int) -> Estimator:
     return functools.partial(estimator, paths=paths)
 
 
-@functools.partial(jax.jit, static_argnames=("estimator", "batch"))
-def _label(key, agent, hazard, sub, estimator, batch):
+@functools.partial(jax.jit, static_argnames=("estimator", "batch", "mesh"))
+def _label(key, agent, hazard, sub, estimator, batch, mesh):
+    def several(keys, agent, hazard, sub):
+        one = lambda row: estimator(*row, sub)  # noqa: E731
+        return jax.lax.map(one, (keys, agent, hazard), batch_size=batch)
+
     count = jax.tree.leaves(agent)[0].shape[0]
     keys = jax.random.split(key, count)
-    one = lambda row: estimator(*row, sub)  # noqa: E731
-    return jax.lax.map(one, (keys, agent, hazard), batch_size=batch)
+    if mesh is not None:
+        several = devices.share_out(several, (0, 0, 0, None), mesh)
+    return several(keys, agent, hazard, sub)
 
 
 def label(
@@ -199,6 +223,7 @@ def label(
     batch: int = 16,
     rows: int = 8192,
     on_progress: Callable[[int, int], None] | None = None,
+    mesh: Mesh | None = None,
 ) -> Labels:
     """Labels many states, leading axis (n,), `rows` to a call and `batch` side by side.
 
@@ -211,15 +236,19 @@ def label(
         batch: rows simulated at once; bounds the memory.
         rows: rows between two reports of progress.
         on_progress: called with (rows done, n).
+        mesh: of devices that share the rows; None for one device.
     """
     count = jax.tree.leaves(agent)[0].shape[0]
+    rows = min(rows, count)
+    rows += 0 if mesh is None else -rows % mesh.size
     parts = []
     for start in range(0, count, rows):
         # The last call repeats rows, so that there is one shape and one compilation.
-        index = jnp.minimum(start + jnp.arange(min(rows, count)), count - 1)
+        index = jnp.minimum(start + jnp.arange(rows), count - 1)
         take = lambda tree, index=index: jax.tree.map(lambda a: a[index], tree)  # noqa: E731
         chunk = jax.random.fold_in(key, start)
-        parts.append(_label(chunk, take(agent), take(hazard), sub, estimator, batch))
+        found = _label(chunk, take(agent), take(hazard), sub, estimator, batch, mesh)
+        parts.append(devices.gather(found, mesh))
         if on_progress:
             jax.block_until_ready(parts[-1])
             on_progress(min(start + rows, count), count)

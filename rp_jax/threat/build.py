@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 
 from rp_jax import statistics
 from rp_jax.hazards import SubRMDP
@@ -57,10 +58,10 @@ class Built(NamedTuple):
     seconds: dict[str, float]  # labels, fit, report
 
 
-def _labelled(key, features, sub, estimator, stage, on_progress) -> Dataset:
+def _labelled(key, features, sub, estimator, stage, on_progress, mesh) -> Dataset:
     agent, hazard = jax.vmap(sub.source.state_of)(features)
     watch = (lambda done, total: on_progress(stage, done, total)) if on_progress else None
-    found = labels.label(key, agent, hazard, sub, estimator, on_progress=watch)
+    found = labels.label(key, agent, hazard, sub, estimator, on_progress=watch, mesh=mesh)
     return Dataset(features, found.threat)
 
 
@@ -161,6 +162,7 @@ def build(
     config: ThreatConfig,
     x: float,
     on_progress: Progress | None = None,
+    mesh: Mesh | None = None,
 ) -> Built:
     """Learns the threat function of one kind of hazard.
 
@@ -171,6 +173,7 @@ def build(
         x: the threshold at which the report counts wrong decisions, and preferential sampling
             and prudence look closely.
         on_progress: told how far each stage is.
+        mesh: of devices that share the rollouts; None for one device.
     """
     keys = jax.random.split(key, 9)
     estimator = labels.best_estimator(sub, config.paths)
@@ -178,14 +181,14 @@ def build(
     began = time.perf_counter()
     first = config.states // 2 if config.sampling == "preferential" else config.states
     features = sampling.uniform(keys[0], sub, first)
-    data = _labelled(keys[1], features, sub, estimator, "labels", on_progress)
+    data = _labelled(keys[1], features, sub, estimator, "labels", on_progress, mesh)
     if config.sampling == "preferential":
         short = dataclasses.replace(config.fit, steps=config.fit.steps // 4)
         scout, _ = fitted(keys[2], sub, data, short, on_progress)
         more = sampling.preferential(
             keys[3], sub, scout, data.features, data.threat, x, config.states - first
         )
-        extra = _labelled(keys[4], more, sub, estimator, "labels", on_progress)
+        extra = _labelled(keys[4], more, sub, estimator, "labels", on_progress, mesh)
         data = Dataset(*map(jnp.concatenate, zip(data, extra, strict=True)))
     jax.block_until_ready(data)
     labelled = time.perf_counter()
@@ -193,14 +196,14 @@ def build(
     facts = {}
     if config.prudence < 1:
         hard = near_threshold(keys[8], sub, model, x, config.test_states)
-        checked = _labelled(keys[6], hard, sub, accurate, "calibration", on_progress)
+        checked = _labelled(keys[6], hard, sub, accurate, "calibration", on_progress, mesh)
         rate, confidence = config.prudence, config.confidence
         model, known = calibrated(model, checked, x, rate, confidence)
         facts = {"calibration": known._asdict()}
     fitted_at = time.perf_counter()
     fresh_key, test_key = jax.random.split(keys[7])
     fresh = sampling.uniform(fresh_key, sub, config.test_states)
-    test = _labelled(test_key, fresh, sub, accurate, "report", on_progress)
+    test = _labelled(test_key, fresh, sub, accurate, "report", on_progress, mesh)
     found = report.compare(np.asarray(report.predict(model, fresh)), np.asarray(test.threat), x)
     seconds = {
         "labels": labelled - began,

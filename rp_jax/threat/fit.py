@@ -9,7 +9,6 @@ import optax
 from jax import Array
 
 from rp_jax.hazards import SubRMDP
-from rp_jax.kinematics import mirrored_threats
 from rp_jax.threat.model import ACTIVATIONS, ThreatModel, ThreatNetwork
 from rp_jax.validate import number, one_of
 
@@ -58,7 +57,7 @@ class FitState(NamedTuple):
 
 def mirror(data: Dataset, sub: SubRMDP) -> Dataset:
     """Adds the left-right mirror image of every row: the sub-R-MDP is symmetric."""
-    swapped = data.threat[:, mirrored_threats(sub.agent)]
+    swapped = data.threat[:, sub.agent.mirrored_threats()]
     return Dataset(
         features=jnp.concatenate([data.features, sub.source.mirrored(data.features)]),
         threat=jnp.concatenate([data.threat, swapped]),

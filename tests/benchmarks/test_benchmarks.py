@@ -24,7 +24,9 @@ from benchmarks import (
 )
 from benchmarks.bound import Bound, Piece, Work
 from benchmarks.measure import Row
-from experiments import circuit, jam
+from experiments import circuit, jam, point_gather
+
+MODULES = {"circuit": circuit, "jam": jam, "point_gather": point_gather}
 
 LIMITS = bound.Limits(operations=1e11, bytes=1e10)
 
@@ -249,8 +251,8 @@ def tiny_tasks(modules=(jam,)):
 
 def test_the_setups_are_the_tuned_recipes():
     found = setups.tasks()
-    assert set(found) == {"circuit", "jam"}
-    for module in (circuit, jam):
+    assert set(found) == set(MODULES)
+    for module in MODULES.values():
         task, config = found[module.__name__.split(".")[-1]]
         assert config == module.quick("tuned")
         assert set(task.threats) == set(task.env.sub_rmdps(task.train))

@@ -10,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from examples.crossing import world as crossing
+from examples.trolley import world as trolley
 from rp_jax.envs import base, circuit, jam, point_gather
 from rp_jax.hazards import SubRMDP
 
@@ -25,6 +27,8 @@ ENVS = {
         point_gather,
         lambda: point_gather.make_params(0, 1, fidelity="paper"),
     ),
+    "crossing": (crossing, lambda: crossing.make_params()),
+    "trolley": (trolley, lambda: trolley.make_params(20)),
 }
 GOES_ON = ("point_gather",)  # after a hit: what is hit is gone
 LIMIT, STEPS, ROWS = 25, 300, 7

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from experiments import circuit, cli, jam, pipeline
+from experiments import circuit, cli, jam, pipeline, point_gather
 from rp_jax.threat import artefact
 from rp_jax.threat.model import ThreatModel, ThreatNetwork
 
-MODULES = {"circuit": circuit, "jam": jam}
+MODULES = {"circuit": circuit, "jam": jam, "point_gather": point_gather}
 as_root = hasattr(os, "geteuid") and os.geteuid() == 0
 
 
@@ -66,6 +66,7 @@ def refused(tmp_path, monkeypatch, capsys):
         (["--preset=[/red]"], "preset is '[/red]'; it must be"),
         (["--seeds", "0"], "seeds is 0; it must be an integer, at least 1"),
         (["--episodes", "-10"], "episodes is -10; it must be"),
+        (["--devices", "two"], "devices is 'two'; it must be one of 'one', 'all', 'cluster'"),
         (["--x", "nan"], "x is nan; it must be a number, at least 0"),
         (["--x", "-0.1"], "x is -0.1; it must be a number, at least 0"),
         (["--penalty", "inf"], "penalty is inf; it must be a finite number"),
@@ -202,7 +203,8 @@ def test_help_lists_presets_recipes_and_settings(name, capsys, tmp_path, monkeyp
         call(name, "--help")
     assert stop.value.code == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    for part in ("--preset", "quick", "full", "--recipe", "tuned", "paper", "--wall.fit.steps"):
+    steps = "--bomb.fit.steps" if name == "point_gather" else "--wall.fit.steps"
+    for part in ("--preset", "quick", "full", "--recipe", "tuned", "paper", steps):
         assert part in text
     assert f"python -m experiments.{name}" in text
     assert list(tmp_path.iterdir()) == []

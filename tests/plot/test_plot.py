@@ -47,6 +47,12 @@ def history(seeds=2, chunks=5, silent=1):
     ]
 
 
+def test_methods_are_compared(path):
+    rows = [{**row, "method": f"method {row['seed']}"} for row in history(seeds=3)]
+    curves.methods(rows, "title", path)
+    drawn(path)
+
+
 @pytest.mark.parametrize("silent", [0, 1, 4])
 def test_learning_curves(silent, path):
     curves.learning_curves(history(silent=silent), "task", path)

@@ -1,0 +1,1 @@
+"""A car on a road that pedestrians cross."""

@@ -1,0 +1,1 @@
+"""A trolley with a swinging load among carts, simulated by brax."""

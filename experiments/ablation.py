@@ -1,0 +1,85 @@
+"""The same learner without a shield, without one but penalised, and with it, from one program."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+import rp_jax
+from experiments import console, pipeline, tables
+from rp_jax import evaluate, storage
+
+RANDOM = 100  # stream of random numbers, apart from the pipeline's
+
+
+def members_of(config: pipeline.Config) -> list[pipeline.Member]:
+    """Of each seed: no shield; no shield, but danger penalised; the shield."""
+    cases = [(float("inf"), 0.0), (float("inf"), config.penalty), (config.x, 0.0)]
+    seeds = range(config.seed, config.seed + config.seeds)
+    return [pipeline.Member(seed, x, penalty) for x, penalty in cases for seed in seeds]
+
+
+def at_random(
+    task: pipeline.Task, config: pipeline.Config, models: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """One row per variant for all actions alike, and for all admissible actions alike."""
+    key = pipeline.key_of(config.seed, RANDOM)
+
+    def policy(key: jax.Array, percept: Any) -> tuple[jax.Array, jax.Array]:
+        values = jax.random.uniform(key, percept.threat.shape)
+        return evaluate.shielded(lambda _: values)(key, percept)
+
+    @jax.jit
+    def play(pmdp: Any) -> evaluate.Episodes:
+        batch = min(1000, config.episodes)
+        return evaluate.play_episodes(key, pmdp, policy, config.episodes, batch=batch)
+
+    rows = []
+    for variant, params in task.tests.items():
+        for x in (float("inf"), config.x):
+            pmdp = pipeline.make_pmdp(task, config, models, params)
+            found = evaluate.summarise(play(pmdp.replace(x=jnp.float32(x))), config.penalty)
+            method = "random" if x == float("inf") else f"random, shield (x={x:g})"
+            rows.append({"variant": variant, "method": method, "x": x, "seed": config.seed} | found)
+    return rows
+
+
+def show(name: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    """One line per variant and method on the terminal."""
+    shown = [
+        {
+            "variant": row["variant"],
+            "method": row["method"],
+            "return": f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}",
+            "crashes": f"{row['crashes']:,} of {row['episodes']:,}",
+            "% [95 %]": tables.percent(row),
+            "goal": f"{row['goal_rate']:.3f}",
+        }
+        for row in rows
+    ]
+    console.table(name, shown, list(shown[0]))
+
+
+def run(task: pipeline.Task, config: pipeline.Config, preset: str, folder: Path) -> None:
+    """The comparison, into a prepared folder: config.json, table.json and learning_curves.png."""
+    settings = {"preset": preset, "task": task.name, **dataclasses.asdict(config)}
+    versions = {"rp_jax": rp_jax.__version__, "jax": jax.__version__}
+    storage.write_json(folder / "config.json", {**settings, "versions": versions})
+    models, _, _ = pipeline.learn_threats(task, config, folder)
+    if models is None:
+        raise ValueError("x is inf; it must be finite where the shield is to be compared")
+    pmdp, members = pipeline.make_pmdp(task, config, models, task.train), members_of(config)
+    trained = pipeline.plan(task, config, pmdp, members, folder)
+    rows = at_random(task, config, models)
+    rows += pipeline.evaluate_all(task, config, pmdp, members, trained)
+    rows.sort(key=lambda row: list(task.tests).index(row["variant"]))
+    show(task.name, rows)
+    storage.write_json(folder / "table.json", rows)
+    if config.figures:
+        from rp_jax.plot import curves
+
+        curves.methods(trained.history, task.name, folder / "learning_curves.png")
+    console.say(f"results: {folder}")
