@@ -84,17 +84,19 @@ def load(folder: Path) -> Run:
     subs = task.env.sub_rmdps(task.train)
     threats = config.threat or folder / "threat"
     models: dict | None = {}
-    used = [path, folder / "agent" / "arrays.npz"]
+    used = [path, folder / "agent" / "manifest.json"]  # these hold the checksums of the arrays
     if np.isinf(config.x):
         models = None
     elif subs:
         models = artefact.load(threats, task.name, subs)
-        used.append(threats / "arrays.npz")
+        used.append(threats / "manifest.json")
     pmdp = pipeline.make_pmdp(task, config, models, task.train)
     shapes = jax.eval_shape(
         lambda key: loop.init(key, pmdp, config.planning)[0].learner.params, jax.random.key(0)
     )
-    like = jax.tree.map(lambda s: np.zeros((config.seeds, *s.shape), s.dtype), shapes)
+    like = jax.tree.map(
+        lambda s: jax.ShapeDtypeStruct((config.seeds, *s.shape), s.dtype), shapes
+    )
     params = storage.load(folder / "agent", "Q-network", like)
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in used)).hexdigest()
     return Run(task, config, models, params, digest)

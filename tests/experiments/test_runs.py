@@ -75,7 +75,7 @@ def test_the_hash_speaks_of_settings_agents_and_threats(finished, tmp_path):
     assert runs.load(copy).sha256 != runs.load(finished).sha256
 
 
-@pytest.mark.parametrize("missing", ["config.json", "agent/arrays.npz", "threat/manifest.json"])
+@pytest.mark.parametrize("missing", ["config.json", "agent/manifest.json", "threat/manifest.json"])
 def test_a_run_with_something_missing_is_refused(missing, finished, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(finished, copy)
