@@ -12,6 +12,7 @@ from jax import Array
 from rp_jax import shield, statistics
 from rp_jax.envs.base import select
 from rp_jax.planning.pmdp import PMDP, Percept
+from rp_jax.validate import finite
 
 # Chooses for a batch of states: (key, percept) -> (actions (B,) or (B, 2), (B,) bool: these are
 # not the actions that it would have preferred).
@@ -112,6 +113,12 @@ def play_episodes(
 
     rows = jax.lax.map(one_round, jax.random.split(key, rounds))
     return jax.tree.map(lambda a: a.reshape(-1)[:episodes], rows)
+
+
+def check(rows: Episodes, name: str) -> None:
+    """Raises FloatingPointError if an episode saw or earned what is not a finite number."""
+    finite(f"{name}: rewards", np.asarray(rows.score))
+    finite(f"{name}: dangers", np.asarray(rows.danger))
 
 
 def summarise(rows: Episodes, penalty: float) -> dict[str, Any]:

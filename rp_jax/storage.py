@@ -163,7 +163,7 @@ def save(folder: Path, kind: str, tree: Any, about: Mapping[str, Any]) -> None:
     except OSError as error:
         raise StorageError(f"{folder}: cannot be created ({error.strerror})") from error
     arrays = leaves(tree)
-    raw = [memoryview(a.reshape(-1).view(np.uint8)) for a in arrays.values()]
+    raw = [a.reshape(-1).view(np.uint8).data for a in arrays.values()]
     digest = hashlib.sha256()
     for part in raw:
         digest.update(part)
@@ -203,7 +203,9 @@ def read_manifest(folder: Path, kind: str) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         raise StorageError(f"{path}: cannot be read ({error})") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise StorageError(f"{path}: format is not {FORMAT}; the file is damaged, or too old or new")
+        raise StorageError(
+            f"{path}: format is not {FORMAT}; the file is damaged, or too old or new"
+        )
     if manifest.get("kind") != kind:
         raise StorageError(f"{path}: kind is {manifest.get('kind')!r}; it must be {kind!r}")
     if not isinstance(manifest.get("about"), dict) or not isinstance(manifest.get("arrays"), dict):
@@ -279,5 +281,5 @@ def _restored(data: memoryview, facts: Mapping[str, Any], like: Any) -> Any:
     if isinstance(like, np.ndarray):
         return array
     if _is_key(like):
-        return jax.random.wrap_key_data(array, impl=jax.random.key_impl(like))
+        return jax.random.wrap_key_data(jax.numpy.array(array), impl=jax.random.key_impl(like))
     return jax.numpy.array(array)

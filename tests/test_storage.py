@@ -276,5 +276,3 @@ def test_a_failed_save_leaves_the_old_one_whole(tmp_path, monkeypatch):
         with pytest.raises(StorageError):
             storage.save(tmp_path, "thing", {"a": jnp.zeros(2)}, {})
     np.testing.assert_array_equal(storage.load(tmp_path, "thing", {"a": jnp.zeros(2)})["a"], 1)
-
-

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import flashbax
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import linen as nn
 from jax import Array
@@ -18,7 +19,7 @@ from rp_jax.planning.dqn import DQNConfig, Learner, Transition
 from rp_jax.planning.networks import NETWORKS
 from rp_jax.planning.nstep import Taken, n_step_transition
 from rp_jax.planning.pmdp import PMDP, Encoded
-from rp_jax.validate import number, one_of
+from rp_jax.validate import finite, number, one_of
 
 
 @dataclass(frozen=True)
@@ -308,3 +309,14 @@ def chunk(
 
     state, metrics = jax.lax.scan(iteration, state, None, length=iterations)
     return state, jax.tree.map(lambda m: jnp.sum(m, axis=0), metrics)
+
+
+def check(state: LoopState, metrics: Metrics) -> None:
+    """Raises FloatingPointError if something in a chunk was not a finite number, naming it.
+
+    Weights tell of gradients: Adam never forgets one that is not finite.
+    """
+    finite("planning: losses", np.asarray(metrics.loss))
+    for name, tree in (("rewards", state.score), ("weights", state.learner.params)):
+        for leaf in jax.tree.leaves(tree):
+            finite(f"planning: {name}", np.asarray(leaf))

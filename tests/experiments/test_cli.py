@@ -219,9 +219,10 @@ def prepared(tmp_path, monkeypatch):
 
     def settings(name, *argv):
         folder = call(name, *argv)
-        (_, config, preset, out) = calls.pop()
+        (_, config, out, checkpoints) = calls.pop()
         assert out == folder
-        return config, preset, folder
+        assert not checkpoints.folder.exists()  # the run is over
+        return config, json.loads((folder / "config.json").read_text())["preset"], folder
 
     return settings
 
