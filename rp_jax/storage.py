@@ -224,7 +224,8 @@ def load(folder: Path, kind: str, like: Any) -> Any:
     Args:
         folder: given to `save`.
         kind: given to `save`.
-        like: arrays, or `jax.ShapeDtypeStruct`s. Where it has numpy's arrays, so has the result.
+        like: arrays and keys; for arrays, `jax.ShapeDtypeStruct`s will do. Where it has numpy's
+            arrays, so has the result.
 
     Raises:
         StorageError: anything is missing, damaged, or of another shape.
