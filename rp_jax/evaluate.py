@@ -29,6 +29,8 @@ class Episodes(NamedTuple):
     interventions: Array  # steps on which the mask changed the policy's own choice
     insecure: Array  # steps without an admissible action
     causes: dict[str, Array]  # bool, what was hit
+    bad_observations: Array  # steps on which a number was nan or infinite
+    bad_threats: Array  # likewise
 
 
 def greedy(network: nn.Module, weights: Any) -> Callable[[Percept], Array]:
@@ -86,7 +88,7 @@ def play_episodes(
         kinds = jax.eval_shape(jax.vmap(pmdp.env.causes, (0, None)), states, pmdp.params)
         causes = dict.fromkeys(kinds, none)
         count = jnp.zeros(batch, jnp.int32)
-        rows = Episodes(zeros, zeros, none, count, count, count, causes)
+        rows = Episodes(zeros, zeros, none, count, count, count, causes, count, count)
 
         def advance(carry):
             t, alive, states, rows = carry
@@ -96,6 +98,7 @@ def play_episodes(
             step = jax.vmap(pmdp.env.step, (0, 0, 0, None))
             reached, outcome = step(step_keys, states, action, pmdp.params)
             hit = jax.vmap(pmdp.env.causes, (0, None))(reached, pmdp.params)
+            bad_observation, bad_threat = percept.faults()
             new = Episodes(
                 score=rows.score + outcome.reward,
                 danger=rows.danger + outcome.danger,
@@ -104,6 +107,8 @@ def play_episodes(
                 interventions=rows.interventions + changed,
                 insecure=rows.insecure + ~percept.secure,
                 causes=jax.tree.map(jnp.logical_or, rows.causes, hit),
+                bad_observations=rows.bad_observations + bad_observation,
+                bad_threats=rows.bad_threats + bad_threat,
             )
             rows = jax.vmap(select)(alive, new, rows)
             return t + 1, alive & ~outcome.done, reached, rows
@@ -117,8 +122,12 @@ def play_episodes(
 
 def check(rows: Episodes, name: str) -> None:
     """Raises FloatingPointError if an episode saw or earned what is not a finite number."""
-    finite(f"{name}: rewards", np.asarray(rows.score))
-    finite(f"{name}: dangers", np.asarray(rows.danger))
+    for what in ("observations", "threats"):
+        count = int(np.sum(getattr(rows, f"bad_{what}")))
+        if count:
+            raise FloatingPointError(f"{name}: {what} of {count:,} steps are nan or infinite")
+    finite(f"{name}: returns", rows.score)
+    finite(f"{name}: dangers", rows.danger)
 
 
 def summarise(rows: Episodes, penalty: float) -> dict[str, Any]:

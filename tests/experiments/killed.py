@@ -19,15 +19,11 @@ from pathlib import Path
 TIMES = {"seconds", "seconds_per_100_actions", "train_seconds"}
 
 
-def worker(argv, kill_at):
-    """A run of the corridor in this process; dies at its `kill_at`-th operation on a file."""
-    sys.path.insert(0, str(Path(__file__).parents[1]))
-    import jax
+def corridor():
+    """The corridor as an experiment of seconds: its presets, and how its task is made."""
     import probe
-    from quick import unoptimised
 
-    from experiments import cli, pipeline
-    from rp_jax import checkpoints
+    from experiments import pipeline
     from rp_jax.planning.loop import LoopConfig
     from rp_jax.threat.build import ThreatConfig
     from rp_jax.threat.fit import FitConfig
@@ -48,6 +44,19 @@ def worker(argv, kill_at):
     def preset(recipe):
         return Config(x=0.5, episodes=64, planning=planning, figures=False)
 
+    return {"quick": preset}, make_task
+
+
+def worker(argv, kill_at):
+    """A run of the corridor in this process; dies at its `kill_at`-th operation on a file."""
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    import jax
+    from quick import unoptimised
+
+    from experiments import cli
+    from rp_jax import checkpoints
+
+    presets, make_task = corridor()
     checkpoints.INTERVAL, checkpoints.SHARE = 0.0, float("inf")
     count = 0
 
@@ -65,7 +74,7 @@ def worker(argv, kill_at):
         setattr(os, name, counted(getattr(os, name)))
     print("ready", flush=True)
     with unoptimised(), jax.numpy_rank_promotion("allow"):
-        cli.main("killed", __doc__, {"quick": preset}, make_task, argv)
+        cli.main("killed", __doc__, presets, make_task, argv)
     print(f"operations {count}", flush=True)
 
 
