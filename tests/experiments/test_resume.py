@@ -59,6 +59,7 @@ def test_a_run_of_another_experiment_is_refused(begun, capsys):
     refused(capsys, "its experiment is killed; it must be other", "--resume", begun, name="other")
 
 
+@pytest.mark.slow
 def test_a_run_stopped_by_nan_goes_on_to_the_same_bits(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(checkpoints, "INTERVAL", 0.0)
     monkeypatch.setattr(checkpoints, "SHARE", float("inf"))
