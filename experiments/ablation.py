@@ -1,6 +1,5 @@
 """The same learner without a shield, without one but penalised, and with it, from one program."""
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,9 +7,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-import rp_jax
-from experiments import console, pipeline, tables
+from experiments import cli, console, pipeline, tables
 from rp_jax import evaluate, storage
+from rp_jax.checkpoints import Checkpoints
 
 RANDOM = 100  # stream of random numbers, apart from the pipeline's
 
@@ -63,18 +62,17 @@ def show(name: str, rows: Sequence[Mapping[str, Any]]) -> None:
     console.table(name, shown, list(shown[0]))
 
 
-def run(task: pipeline.Task, config: pipeline.Config, preset: str, folder: Path) -> None:
-    """The comparison, into a prepared folder: config.json, table.json and learning_curves.png."""
-    settings = {"preset": preset, "task": task.name, **dataclasses.asdict(config)}
-    versions = {"rp_jax": rp_jax.__version__, "jax": jax.__version__}
-    storage.write_json(folder / "config.json", {**settings, "versions": versions})
-    models, _, _ = pipeline.learn_threats(task, config, folder)
+def run(
+    task: pipeline.Task, config: pipeline.Config, folder: Path, checkpoints: Checkpoints
+) -> None:
+    """The comparison, into a prepared folder: table.json and learning_curves.png."""
+    models, _, _ = pipeline.learn_threats(task, config, folder, checkpoints)
     if models is None:
-        raise ValueError("x is inf; it must be finite where the shield is to be compared")
+        with cli.bad_input():
+            raise ValueError("x is inf; it must be finite where the shield is to be compared")
     pmdp, members = pipeline.make_pmdp(task, config, models, task.train), members_of(config)
-    trained = pipeline.plan(task, config, pmdp, members, folder)
-    rows = at_random(task, config, models)
-    rows += pipeline.evaluate_all(task, config, pmdp, members, trained)
+    trained, found = pipeline.plan_and_evaluate(task, config, pmdp, members, folder, checkpoints)
+    rows = at_random(task, config, models) + found
     rows.sort(key=lambda row: list(task.tests).index(row["variant"]))
     show(task.name, rows)
     storage.write_json(folder / "table.json", rows)

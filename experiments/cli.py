@@ -1,6 +1,7 @@
 """The command line of an experiment: a preset, and any setting overridden."""
 
 import argparse
+import dataclasses
 import importlib.util
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,8 +11,10 @@ from typing import Any
 
 import tyro
 
-from experiments import console, pipeline
+from experiments import console, pipeline, settings
 from experiments.recipes import RECIPES
+from rp_jax import storage
+from rp_jax.checkpoints import Checkpoints
 from rp_jax.validate import one_of
 
 
@@ -21,7 +24,7 @@ def main(
     presets: Mapping[str, Callable[[str], Any]],
     make_task: Callable[[Any], pipeline.Task],
     argv: Sequence[str] | None = None,
-    run: Callable[[pipeline.Task, Any, str, Path], None] | None = None,
+    run: Callable[[pipeline.Task, Any, Path, Checkpoints], None] | None = None,
 ) -> Path:
     """Runs an experiment from the command line; exits with 2 on bad input.
 
@@ -31,7 +34,7 @@ def main(
         presets: by name, functions from a recipe's name to a configuration.
         make_task: from a configuration to the task.
         argv: arguments, the process's own if not given.
-        run: does the job with (task, configuration, preset, new folder); `pipeline.run` if not
+        run: does the job with (task, configuration, folder, checkpoints); `pipeline.run` if not
             given.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
@@ -39,25 +42,82 @@ def main(
     first.add_argument("--preset", default="quick")
     first.add_argument("--recipe", default=RECIPES[0])
     chosen, rest = first.parse_known_args(argv)
+    folder = to_resume(argv)
     with bad_input():
         preset = presets[one_of("preset", chosen.preset, presets)]
         config = preset(one_of("recipe", chosen.recipe, RECIPES))
-        text = (
-            f"{about}\n\n--preset {{{','.join(presets)}}} (default quick) and --recipe "
-            f"{{{','.join(RECIPES)}}} (default {RECIPES[0]}) choose the values below; any of "
-            "them can be overridden."
-        )
-        config = tyro.cli(
-            type(config), default=config, args=rest, prog=f"python -m {name}", description=text
-        )
-        needs_matplotlib(config.figures)
-        task, folder = pipeline.prepare(make_task, config, chosen.preset)
-    try:
-        (run or pipeline.run)(task, config, chosen.preset, folder)
-    except KeyboardInterrupt:
-        console.say(f"interrupted: what was finished is in {folder}", style="yellow")
-        raise SystemExit(130) from None
+        if folder is not None:
+            config, checkpoints = resumed(name, folder, type(config), argv)
+            task = pipeline.checked(make_task, config)
+        else:
+            config = tyro.cli(
+                type(config),
+                default=config,
+                args=rest,
+                prog=f"python -m {name}",
+                description=_description(about, presets),
+            )
+            needs_matplotlib(config.figures)
+            task, folder = pipeline.prepare(make_task, config, chosen.preset)
+            plain = {"preset": chosen.preset, "task": task.name, **dataclasses.asdict(config)}
+            checkpoints = settings.begin(folder, name, plain)
+    with resumable(name, folder, checkpoints):
+        (run or pipeline.run)(task, config, folder, checkpoints)
     return folder
+
+
+def to_resume(argv: Sequence[str]) -> Path | None:
+    """DIR of --resume DIR, if that is given."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--resume", type=Path)
+    return parser.parse_known_args(argv)[0].resume
+
+
+def resumed(name: str, folder: Path, kind: type, argv: Sequence[str]) -> tuple[Any, Checkpoints]:
+    """Settings and checkpoints of an interrupted run.
+
+    Args:
+        name: of the module that is to go on with it.
+        folder: of the run.
+        kind: of the settings.
+        argv: all arguments.
+
+    Raises:
+        ValueError: there are other arguments, or the run cannot be resumed by this module.
+    """
+    if list(argv) not in (["--resume", str(folder)], [f"--resume={folder}"]):
+        raise ValueError(
+            f"resume is {folder}; no other option may be given with it: the settings are those in "
+            "its config.json"
+        )
+    plain = settings.interrupted(folder, name)
+    config = settings.restored(kind, plain, str(folder / "config.json"))
+    if config.devices == "cluster":
+        raise ValueError(f"resume is {folder}; its devices is 'cluster'; it must be 'one' or 'all'")
+    return config, settings.checkpoints_of(folder)
+
+
+@contextmanager
+def resumable(name: str, folder: Path, checkpoints: Checkpoints) -> Iterator[None]:
+    """Around a run: says how to go on if it is stopped, exits with 130 (Ctrl-C) or 1 (an error)."""
+    again = f"to go on: python -m {name} --resume {folder}"
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        console.say(f"interrupted ({stop or 'between two steps'}); {again}", style="yellow")
+        raise SystemExit(130) from None
+    except (FloatingPointError, storage.StorageError) as error:
+        console.say(f"error: {error}; {again}", style="red")
+        raise SystemExit(1) from None
+    checkpoints.clear()
+
+
+def _description(about: str, presets: Mapping[str, Any]) -> str:
+    return (
+        f"{about}\n\n--preset {{{','.join(presets)}}} (default quick) and --recipe "
+        f"{{{','.join(RECIPES)}}} (default {RECIPES[0]}) choose the values below; any of "
+        "them can be overridden. --resume DIR, alone, goes on with an interrupted run."
+    )
 
 
 def needs_matplotlib(figures: bool) -> None:

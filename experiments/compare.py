@@ -8,6 +8,7 @@ python -m experiments.compare --env jam
 
 import dataclasses
 import functools
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,16 +16,19 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import tyro
 
 from experiments import cli, console, mpc, pipeline, tables
 from experiments.runs import EXPERIMENTS
+from experiments.settings import begin
 from rp_jax import evaluate, storage
 from rp_jax.baselines import actor_critic, cpo, pid_lagrangian
+from rp_jax.checkpoints import Checkpoints
 from rp_jax.planning.pmdp import PMDP
-from rp_jax.validate import number, one_of
+from rp_jax.validate import finite, number, one_of
 
 # Penalties of DQN, c, and steps that MPC looks ahead; section 5 and appendix G.
 SETTINGS: dict[str, tuple[tuple[float, ...], float, int]] = {
@@ -83,12 +87,11 @@ def by_q_learning(
     models: dict | None,
     members: Sequence[pipeline.Member],
     folder: Path,
+    checkpoints: Checkpoints,
 ) -> list[dict[str, Any]]:
     """Rows of RP or of penalised DQN; all members learn in one program."""
-    folder.mkdir()
     pmdp = pipeline.make_pmdp(task, config, models, task.train)
-    trained = pipeline.plan(task, config, pmdp, members, folder)
-    rows = pipeline.evaluate_all(task, config, pmdp, members, trained)
+    trained, rows = pipeline.plan_and_evaluate(task, config, pmdp, members, folder, checkpoints)
     for row in rows:
         name, seed = row["method"], row["seed"]
         mine = [h for h in trained.history if (h["method"], h["seed"]) == (name, seed)]
@@ -99,7 +102,13 @@ def by_q_learning(
 
 
 def by_policy_gradient(
-    name: str, learner: Any, learning: Any, limit: float, task: pipeline.Task, config: Any
+    name: str,
+    learner: Any,
+    learning: Any,
+    limit: float,
+    task: pipeline.Task,
+    config: Any,
+    checkpoints: Checkpoints,
 ) -> list[dict[str, Any]]:
     """Rows of CPO or of PID-Lagrangian PPO; all seeds learn in one program.
 
@@ -110,6 +119,7 @@ def by_policy_gradient(
         limit: c.
         task: what is learned.
         config: the task's settings.
+        checkpoints: of the learning.
     """
     members = pipeline.members_of(config)
     pmdp = pipeline.make_pmdp(task, config, None, task.train)
@@ -124,17 +134,22 @@ def by_policy_gradient(
         )
         state, c = init(keys, pmdp), jnp.asarray(limit, jnp.float32)
         improve = step.lower(state, pmdp, c).compile()
-        began, sums = time.perf_counter(), None
-        for i in range(steps):
-            state, metrics = improve(state, pmdp, c)
-            found = jax.tree.map(np.asarray, metrics.rollout)
-            sums = found if sums is None else jax.tree.map(np.add, sums, found)
-            ended = max(1.0, float(found.episodes.sum()))
-            note = f"return {(found.score - config.penalty * found.danger).sum() / ended:.1f}"
+
+        def advance(i: int, carried: tuple[Any, Any]) -> tuple[Any, Any]:
+            state, metrics = improve(carried[0], pmdp, c)
+            sums = jax.tree.map(np.add, carried[1], jax.tree.map(np.asarray, metrics.rollout))
+            finite(f"{name}: weights", jax.flatten_util.ravel_pytree(_actor(learner, state))[0])
+            ended = max(1.0, float(sums.episodes.sum()))
+            note = f"return {(sums.score - config.penalty * sums.danger).sum() / ended:.1f}"
             bar("", i + 1, steps, note)
+            return state, sums
+
+        began = time.perf_counter()
+        shapes = jax.eval_shape(step, state, pmdp, c)[1].rollout
+        blank = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), shapes)
+        state, sums = checkpoints.loop((state, blank), advance, steps)
         seconds = time.perf_counter() - began
-    assert sums is not None
-    weights = state.actor if learner is cpo else state.learner.actor
+    weights = _actor(learner, state)
     rows = []
     for row in _evaluated(name, weights, learning.rollout, pmdp, members, task, config):
         i = row["seed"] - config.seed
@@ -144,6 +159,10 @@ def by_policy_gradient(
         row["training_danger"] = float(sums.danger[i])
         rows.append(row)
     return rows
+
+
+def _actor(learner: Any, state: Any) -> Any:
+    return state.actor if learner is cpo else state.learner.actor
 
 
 def _evaluated(
@@ -202,7 +221,9 @@ def by_search(config: Config, horizon: int) -> list[dict[str, Any]]:
     return [{**row, **nothing} for row in rows]
 
 
-def run(config: Config, settings: Any, task: pipeline.Task, folder: Path) -> list[dict[str, Any]]:
+def run(
+    config: Config, settings: Any, task: pipeline.Task, folder: Path, checkpoints: Checkpoints
+) -> list[dict[str, Any]]:
     """Writes compare.json after each method, so that nothing is lost."""
     penalties, limit, horizon = SETTINGS[config.env]
     rows: list[dict[str, Any]] = []
@@ -212,19 +233,23 @@ def run(config: Config, settings: Any, task: pipeline.Task, folder: Path) -> lis
         storage.write_json(folder / "compare.json", rows)
 
     if "RP" in config.methods:
-        models, _, _ = pipeline.learn_threats(task, settings, folder)
+        models, _, _ = pipeline.learn_threats(task, settings, folder, checkpoints)
         members = pipeline.members_of(settings)
-        add(by_q_learning(task, settings, models, members, folder / "rp"))
+        at = checkpoints.at("rp")
+        add(by_q_learning(task, settings, models, members, folder / "rp", at))
     if "DQN" in config.methods:
         plain = dataclasses.replace(settings, x=float("inf"))
         each = pipeline.members_of(plain)
         members = [m._replace(learning_penalty=p) for p in penalties for m in each]
-        add(by_q_learning(task, plain, None, members, folder / "dqn"))
+        at = checkpoints.at("dqn")
+        add(by_q_learning(task, plain, None, members, folder / "dqn", at))
     if "CPO" in config.methods:
-        add(by_policy_gradient("CPO", cpo, cpo.CPOConfig(), limit, task, settings))
+        at = checkpoints.at("cpo")
+        add(by_policy_gradient("CPO", cpo, cpo.CPOConfig(), limit, task, settings, at))
     if "PID" in config.methods:
-        learning = pid_lagrangian.PIDConfig()
-        add(by_policy_gradient("PID-Lagrangian", pid_lagrangian, learning, limit, task, settings))
+        learner, learning, at = pid_lagrangian, pid_lagrangian.PIDConfig(), checkpoints.at("pid")
+        name = "PID-Lagrangian"
+        add(by_policy_gradient(name, learner, learning, limit, task, settings, at))
     if "MPC" in config.methods:
         add(by_search(config, horizon))
     return rows
@@ -255,16 +280,25 @@ def show(rows: Sequence[dict[str, Any]]) -> None:
 
 def main() -> None:
     """Exits with 2 on bad input."""
-    config = tyro.cli(Config, prog="python -m experiments.compare", description=__doc__)
+    name, argv = "experiments.compare", sys.argv[1:]
+    folder = cli.to_resume(argv)
     with cli.bad_input():
-        settings = settings_of(config)
-        settings = dataclasses.replace(
-            settings, out=config.out or pipeline.default_out("compare", config.env)
-        )
-        task, folder = pipeline.prepare(EXPERIMENTS[config.env].make_task, settings, "compare")
-    storage.write_json(folder / "config.json", dataclasses.asdict(config))
-    show(run(config, settings, task, folder))
-    console.say(f"results: {folder}")
+        if folder is not None:
+            config, checkpoints = cli.resumed(name, folder, Config, argv)
+            settings = settings_of(config)
+            task = pipeline.checked(EXPERIMENTS[config.env].make_task, settings)
+        else:
+            about = f"{__doc__}\n\n--resume DIR, alone, goes on with an interrupted run."
+            config = tyro.cli(Config, prog=f"python -m {name}", description=about)
+            settings = dataclasses.replace(
+                settings_of(config), out=config.out or pipeline.default_out("compare", config.env)
+            )
+            make_task = EXPERIMENTS[config.env].make_task
+            task, folder = pipeline.prepare(make_task, settings, "compare")
+            checkpoints = begin(folder, name, dataclasses.asdict(config))
+    with cli.resumable(name, folder, checkpoints):
+        show(run(config, settings, task, folder, checkpoints))
+        console.say(f"results: {folder}")
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ import numpy as np
 
 from experiments import cli, console, jam, pipeline, tables
 from rp_jax import storage
+from rp_jax.checkpoints import Checkpoints
 from rp_jax.planning import conditioned
 from rp_jax.validate import number
 
@@ -60,20 +61,19 @@ def told(
     return task._replace(env=whole.env, train=whole.params, tests=tests), whole, members
 
 
-def run(task: pipeline.Task, config: Config, preset: str, folder: Path) -> None:
+def run(task: pipeline.Task, config: Config, folder: Path, checkpoints: Checkpoints) -> None:
     """Trains and evaluates both, into a prepared folder: frontier.json and the figure."""
-    settings = {"preset": preset, "task": task.name, **dataclasses.asdict(config)}
-    storage.write_json(folder / "config.json", settings)
-    models, _, _ = pipeline.learn_threats(task, config, folder)
+    models, _, _ = pipeline.learn_threats(task, config, folder, checkpoints)
     pmdp, members = pipeline.make_pmdp(task, config, models, task.train), members_of(config)
-    for name in ("separate", "told"):
-        (folder / name).mkdir()
-    separate = pipeline.plan(task, config, pmdp, members, folder / "separate")
-    rows = pipeline.evaluate_all(task, config, pmdp, members, separate)
+    _, rows = pipeline.plan_and_evaluate(
+        task, config, pmdp, members, folder / "separate", checkpoints.at("separate")
+    )
     found = [{"planner": "separate", **row} for row in rows]
     task, pmdp, members = told(task, config, pmdp)
-    one = pipeline.plan(task, config, pmdp, members, folder / "told")
-    for row in pipeline.evaluate_all(task, config, pmdp, members, one):
+    _, rows = pipeline.plan_and_evaluate(
+        task, config, pmdp, members, folder / "told", checkpoints.at("told")
+    )
+    for row in rows:
         variant, x = row["variant"].rsplit(" x=", 1)
         found.append({"planner": "told x", **row, "variant": variant, "x": float(x)})
     found = summarised(found)

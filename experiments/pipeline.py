@@ -18,6 +18,7 @@ import numpy as np
 import rp_jax
 from experiments import console, tables
 from rp_jax import devices, evaluate, shield, storage
+from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
 from rp_jax.envs.base import BASELINES, Env
 from rp_jax.planning import loop
 from rp_jax.planning.loop import LoopConfig
@@ -120,7 +121,9 @@ def default_out(task: str, preset: str) -> Path:
     return Path("results") / f"{task}-{preset}-{now}"
 
 
-def learn_threats(task: Task, config: Config, folder: Path) -> tuple[dict | None, dict, dict]:
+def learn_threats(
+    task: Task, config: Config, folder: Path, checkpoints: Checkpoints = NO_CHECKPOINTS
+) -> tuple[dict | None, dict, dict]:
     """The threat models of all kinds of hazard: loaded, or learned and saved.
 
     Returns:
@@ -137,14 +140,13 @@ def learn_threats(task: Task, config: Config, folder: Path) -> tuple[dict | None
     keys = jax.random.split(key_of(config.seed, THREAT), len(subs))
     for key, kind in zip(keys, sorted(subs), strict=True):
         with console.progress(f"threat of {kind}") as bar:
-            built[kind] = build.build(
-                key, subs[kind], task.threats[kind], config.x, bar, devices.mesh_of(config.devices)
-            )
-    models = {kind: b.model for kind, b in built.items()}
+            threat, at = task.threats[kind], checkpoints.at("threat").at(kind)
+            mesh = devices.mesh_of(config.devices)
+            built[kind] = build.build(key, subs[kind], threat, config.x, bar, mesh, at)
+    models = devices.agreed({kind: b.model for kind, b in built.items()})
     reports = {kind: b.report for kind, b in built.items()}
     timings = {kind: b.seconds for kind, b in built.items()}
-    models = devices.agreed(models)
-    sums = sum_reports(key_of(config.seed, SUMS), task, config, models)
+    sums = sum_reports(key_of(config.seed, SUMS), task, config, models, checkpoints.at("sums"))
     curves = {kind: b.curve for kind, b in built.items()}
     about = {
         "x": config.x,
@@ -163,7 +165,13 @@ def learn_threats(task: Task, config: Config, folder: Path) -> tuple[dict | None
     return models, curves, timings
 
 
-def sum_reports(key: jax.Array, task: Task, config: Config, models: Mapping) -> dict:
+def sum_reports(
+    key: jax.Array,
+    task: Task,
+    config: Config,
+    models: Mapping,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
+) -> dict:
     """By kind of hazard, the models' sums against accurate ones on states of the task."""
     walk, *keys = jax.random.split(key, 1 + len(models))
     pmdp = make_pmdp(task, config, models, task.train)
@@ -175,7 +183,9 @@ def sum_reports(key: jax.Array, task: Task, config: Config, models: Mapping) -> 
         estimator = labels.best_estimator(subs[kind], task.threats[kind].test_paths)
         with console.progress(f"sum over {kind}s") as bar:
             bar("", 0, 1)
-            true = report.labelled_sum(key, states.agent, hazards[kind], subs[kind], estimator)
+            true = report.labelled_sum(
+                key, states.agent, hazards[kind], subs[kind], estimator, checkpoints.at(kind)
+            )
             only = {kind: models[kind]}
             said = total_threat(only, states.agent, {kind: hazards[kind]})
             bar("", 1, 1)
@@ -223,10 +233,26 @@ def method_name(config: Config, member: Member | None = None) -> str:
     return name if penalty == 0 else f"{name[:-1]}, {penalty:g})"
 
 
+class Record(NamedTuple):
+    """What happened in each chunk of a training run."""
+
+    metrics: loop.Metrics  # (chunks, members)
+    seconds: np.ndarray  # (chunks,) since the beginning, interruptions left out
+
+
 def plan(
-    task: Task, config: Config, pmdp: PMDP, members: Sequence[Member], folder: Path
+    task: Task,
+    config: Config,
+    pmdp: PMDP,
+    members: Sequence[Member],
+    folder: Path,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> Trained:
-    """Trains all members as one program; writes metrics.jsonl as it goes."""
+    """Trains all members as one program; writes metrics.jsonl as it goes.
+
+    Raises:
+        FloatingPointError: something that was seen or learned is not a finite number.
+    """
     planning = config.planning
     warm = -(-planning.replay_start // planning.num_envs)  # iterations before learning
     length = -(-max(1, planning.iterations - warm) // CHUNKS)
@@ -241,7 +267,10 @@ def plan(
     pmdp, axes = side_by_side(pmdp, members)
     mesh = devices.mesh_of(config.devices)
     keys, pmdp = devices.place((keys, pmdp), (0, axes), mesh)
-    history: list[dict[str, Any]] = []
+
+    def history(record: Record, done: int) -> list[dict[str, Any]]:
+        return _history(record, done, config, members, length * planning.updates)
+
     with console.progress("planning") as bar:
         bar("", 0, chunks, "compiling")
         began = time.perf_counter()
@@ -252,52 +281,70 @@ def plan(
         chunk = jax.jit(devices.spread(onward, (0, axes), mesh), donate_argnums=0)
         shapes, _ = jax.eval_shape(init, keys, pmdp)
         step = chunk.lower(devices.placed(shapes, mesh), pmdp).compile()
-        compiled = time.perf_counter()
-        state, metrics = start(keys, pmdp)
-        for i in range(chunks):
+        compiled = now = time.perf_counter()
+
+        def advance(i: int, carried: tuple[loop.LoopState, Record]):
+            nonlocal now
+            state, record = carried
             state, new = step(state, pmdp)
-            metrics = jax.tree.map(jnp.add, metrics, new) if i == 0 else new
-            rows = _chunk_rows(
-                devices.gather(metrics, mesh), config, members, length * planning.updates, history
-            )
-            history += rows
-            seconds = time.perf_counter() - compiled
-            for row in rows:
-                row["seconds"] = seconds
-            _append_lines(folder / "metrics.jsonl", rows)
-            bar("", i + 1, chunks, _note(rows))
-    about = {"methods": methods, "members": [member._asdict() for member in members]}
-    params = devices.gather(state.learner.params, mesh)
-    storage.save(folder / "agent", "Q-network", params, about)
-    return Trained(params, history, seconds, compiled - began)
+            for whole, part in zip(record.metrics, devices.gather(new, mesh), strict=True):
+                whole[i] += part
+            params = devices.gather(state.learner.params, mesh)
+            loop.check(params, jax.tree.map(lambda m: m[i], record.metrics))
+            now, before = time.perf_counter(), now
+            record.seconds[i] = record.seconds[i - 1] + now - before
+            rows = history(record, i + 1)
+            _write_lines(folder / "metrics.jsonl", rows)
+            bar("", i + 1, chunks, _note(rows[-len(members) :]))
+            return state, record
 
-
-def _chunk_rows(
-    metrics, config: Config, members: Sequence[Member], updates: int, history: Sequence
-) -> list[dict]:
-    """One row per member of what happened in a chunk."""
-    sums = {name: np.asarray(value) for name, value in metrics._asdict().items()}
-    before = [row["steps"] for row in history[-len(members) :]] or [0] * len(members)
-    rows = []
-    for i, member in enumerate(members):
-        of = {name: float(value[i]) for name, value in sums.items()}
-        ended = max(of["episodes"], 1.0)
-        rows.append(
-            {
-                "seed": member.seed,
-                "method": method_name(config, member),
-                "steps": int(of["steps"]) + before[i],
-                "episodes": int(of["episodes"]),
-                "return_mean": (of["score"] - config.penalty * of["danger"]) / ended
-                if of["episodes"]
-                else float("nan"),
-                "crashes": int(of["crashes"]),
-                "goal_rate": of["goals"] / ended,
-                "insecure": of["insecure"] / of["steps"],
-                "inadmissible": int(of["inadmissible"]),
-                "loss": of["loss"] / updates,
-            }
+        state, metrics = start(keys, pmdp)
+        metrics = devices.gather(metrics, mesh)
+        blank = jax.tree.map(lambda m: np.zeros((chunks, *m.shape), m.dtype), metrics)
+        for whole, part in zip(blank, metrics, strict=True):
+            whole[0] = part  # what filled the replay belongs to the first chunk
+        record = Record(blank, np.zeros(chunks, np.float32))
+        params, record = (checkpoints if mesh is None else NO_CHECKPOINTS).loop(
+            (state, record),
+            advance,
+            chunks,
+            lambda carried: (carried[0].learner.params, carried[1]),
         )
+        params = devices.gather(params, mesh)
+    about = {"methods": methods, "members": [member._asdict() for member in members]}
+    storage.save(folder / "agent", "Q-network", params, about)
+    rows = history(record, chunks)
+    _write_lines(folder / "metrics.jsonl", rows)
+    return Trained(params, rows, float(record.seconds[-1]), compiled - began)
+
+
+def _history(
+    record: Record, done: int, config: Config, members: Sequence[Member], updates: int
+) -> list[dict[str, Any]]:
+    """One row per chunk and member."""
+    rows = []
+    steps = np.cumsum(record.metrics.steps.astype(int), axis=0)
+    for chunk in range(done):
+        for i, member in enumerate(members):
+            of = {name: float(m[chunk, i]) for name, m in record.metrics._asdict().items()}
+            ended = max(of["episodes"], 1.0)
+            rows.append(
+                {
+                    "seed": member.seed,
+                    "method": method_name(config, member),
+                    "steps": int(steps[chunk, i]),
+                    "episodes": int(of["episodes"]),
+                    "return_mean": (of["score"] - config.penalty * of["danger"]) / ended
+                    if of["episodes"]
+                    else float("nan"),
+                    "crashes": int(of["crashes"]),
+                    "goal_rate": of["goals"] / ended,
+                    "insecure": of["insecure"] / of["steps"],
+                    "inadmissible": int(of["inadmissible"]),
+                    "loss": of["loss"] / updates,
+                    "seconds": float(record.seconds[chunk]),
+                }
+            )
     return rows
 
 
@@ -307,17 +354,25 @@ def _note(rows: Sequence[Mapping]) -> str:
     return f"return {returns:.1f}, {crashes} crashes in {ended} episodes"
 
 
-def _append_lines(path: Path, rows: Sequence[Mapping]) -> None:
-    with path.open("a") as file:
-        for row in rows:
-            plain = {k: None if v != v else v for k, v in row.items()}
-            file.write(json.dumps(plain) + "\n")
+def _write_lines(path: Path, rows: Sequence[Mapping]) -> None:
+    """The whole file each time: no line of it is ever half there, or there twice."""
+    plain = [{k: None if v != v else v for k, v in row.items()} for row in rows]
+    storage.write_bytes(path, "".join(json.dumps(row) + "\n" for row in plain).encode())
 
 
 def evaluate_all(
-    task: Task, config: Config, pmdp: PMDP, members: Sequence[Member], trained: Trained
+    task: Task,
+    config: Config,
+    pmdp: PMDP,
+    members: Sequence[Member],
+    trained: Trained,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> list[dict[str, Any]]:
-    """One row per variant and member."""
+    """One row per variant and member.
+
+    Raises:
+        FloatingPointError: an observation, a threat or a reward is not a finite number.
+    """
     pmdp, axes = side_by_side(pmdp, members)
     network = loop.make_network(config.planning, pmdp)
     batch = min(1000, config.episodes)
@@ -329,33 +384,60 @@ def evaluate_all(
     mesh, places = devices.mesh_of(config.devices), (0, 0, axes)
     everyone = jax.jit(devices.spread(one, places, mesh))
     keys = keys_of(members, EVALUATION)
-    rows = []
+    variants = {name: pmdp.replace(params=params) for name, params in task.tests.items()}
     with console.progress("evaluation") as bar:
-        for done, (variant, params) in enumerate(task.tests.items()):
-            bar("", done, len(task.tests), f"{variant}: {config.episodes:,} episodes a seed")
-            this = pmdp.replace(params=params)
+
+        def play(i: int, found: dict[str, evaluate.Episodes]) -> dict[str, evaluate.Episodes]:
+            name, this = list(variants.items())[i]
+            bar("", i, len(variants), f"{name}: {config.episodes:,} episodes a seed")
             given = devices.place((keys, trained.params, this), places, mesh)
             episodes = jax.tree.map(np.asarray, devices.gather(everyone(*given), mesh))
-            first = jax.tree.map(lambda a: a[0], trained.params)
-            seconds = action_seconds(this.replace(x=this.x[0]), network, first)
-            for i, member in enumerate(members):
-                found = evaluate.summarise(
-                    jax.tree.map(lambda a, i=i: a[i], episodes), config.penalty
-                )
-                rows.append(
-                    {
-                        "env": task.name,
-                        "variant": variant,
-                        "method": method_name(config, member),
-                        "x": member.x,
-                        "seed": member.seed,
-                        **found,
-                        "seconds_per_100_actions": seconds,
-                        "train_seconds": trained.seconds,
-                    }
-                )
-            bar("", done + 1, len(task.tests))
+            evaluate.check(episodes, name)
+            bar("", i + 1, len(variants))
+            return {**found, name: episodes}
+
+        shapes = {
+            name: jax.eval_shape(everyone, keys, trained.params, this)
+            for name, this in variants.items()
+        }
+        blank = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), shapes)
+        episodes = checkpoints.loop(blank, play, len(variants))
+    first = jax.tree.map(lambda a: a[0], trained.params)
+    rows = []
+    for variant, this in variants.items():
+        seconds = action_seconds(this.replace(x=this.x[0]), network, first)
+        for i, member in enumerate(members):
+            found = evaluate.summarise(
+                jax.tree.map(lambda a, i=i: a[i], episodes[variant]), config.penalty
+            )
+            rows.append(
+                {
+                    "env": task.name,
+                    "variant": variant,
+                    "method": method_name(config, member),
+                    "x": member.x,
+                    "seed": member.seed,
+                    **found,
+                    "seconds_per_100_actions": seconds,
+                    "train_seconds": trained.seconds,
+                }
+            )
     return rows
+
+
+def plan_and_evaluate(
+    task: Task,
+    config: Config,
+    pmdp: PMDP,
+    members: Sequence[Member],
+    folder: Path,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
+) -> tuple[Trained, list[dict[str, Any]]]:
+    """`plan` into a folder, created if missing, then `evaluate_all`."""
+    folder.mkdir(exist_ok=True)
+    trained = plan(task, config, pmdp, members, folder, checkpoints.at("planning"))
+    found = evaluate_all(task, config, pmdp, members, trained, checkpoints.at("evaluation"))
+    return trained, found
 
 
 def action_seconds(pmdp: PMDP, network: Any, params: Any) -> float:
@@ -380,11 +462,8 @@ def seconds_of_100(act: Callable[[], jax.Array]) -> float:
     return time.perf_counter() - began
 
 
-def prepare(make_task: Callable[[Any], Task], config: Config, preset: str) -> tuple[Task, Path]:
-    """Finds everything that can be wrong with the input, before any long work.
-
-    Returns:
-        the task and the new folder for its results.
+def checked(make_task: Callable[[Any], Task], config: Config) -> Task:
+    """Finds everything that can be wrong with the settings, before any long work.
 
     Raises:
         ValueError: a setting is out of range, or a file cannot be used.
@@ -397,27 +476,28 @@ def prepare(make_task: Callable[[Any], Task], config: Config, preset: str) -> tu
         threat.validate(kind)
     if config.threat is not None:
         artefact.load(config.threat, task.name, task.env.sub_rmdps(task.train))
+    return task
+
+
+def prepare(make_task: Callable[[Any], Task], config: Config, preset: str) -> tuple[Task, Path]:
+    """`checked`, and the new folder for the results.
+
+    Raises:
+        ValueError: a setting is out of range, or a file or the folder cannot be used.
+    """
+    task = checked(make_task, config)
     if not devices.is_first():  # what the others write is thrown away
         return task, Path(tempfile.mkdtemp())
     return task, storage.new_folder(config.out or default_out(task.name, preset))
 
 
-def run(task: Task, config: Config, preset: str, folder: Path) -> None:
-    """The whole job, into a prepared folder."""
+def run(task: Task, config: Config, folder: Path, checkpoints: Checkpoints) -> None:
+    """The whole job, into a folder that has its config.json."""
     began = time.perf_counter()
-    settings = {
-        "preset": preset,
-        "task": task.name,
-        **dataclasses.asdict(config),
-        "versions": {"rp_jax": rp_jax.__version__, "jax": jax.__version__},
-        "device": str(jax.devices()[0]),
-    }
-    storage.write_json(folder / "config.json", settings)
-    models, curves, parts = learn_threats(task, config, folder)
+    models, curves, parts = learn_threats(task, config, folder, checkpoints)
     reconnaissance = time.perf_counter() - began
     pmdp, members = make_pmdp(task, config, models, task.train), members_of(config)
-    trained = plan(task, config, pmdp, members, folder)
-    rows = evaluate_all(task, config, pmdp, members, trained)
+    trained, rows = plan_and_evaluate(task, config, pmdp, members, folder, checkpoints)
     tables.write(folder, rows)
     training = {
         "steps": sum(row["steps"] for row in trained.history[-config.seeds :]),
@@ -440,7 +520,7 @@ def run(task: Task, config: Config, preset: str, folder: Path) -> None:
     )
     if config.figures and task.draw is not None:
         figures = folder / "figures"
-        figures.mkdir()
+        figures.mkdir(exist_ok=True)
         with console.progress("figures") as bar:
             task.draw(Finished(task, config, pmdp, trained, rows, curves, figures, bar))
     console.say(f"results: {folder}")

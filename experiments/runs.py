@@ -1,11 +1,6 @@
 """Finished runs, read back from their folders: settings, threat models and agents."""
 
-import dataclasses
 import hashlib
-import json
-import types
-import typing
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +8,7 @@ import jax
 import numpy as np
 from flax import linen as nn
 
-from experiments import circuit, jam, pipeline, point_gather
+from experiments import circuit, jam, pipeline, point_gather, settings
 from rp_jax import storage
 from rp_jax.planning import loop
 from rp_jax.planning.pmdp import PMDP
@@ -70,64 +65,25 @@ def load(folder: Path) -> Run:
         ValueError: something is missing, damaged, or does not fit together.
     """
     folder = Path(folder)
-    path = folder / "config.json"
-    try:
-        settings = json.loads(path.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise storage.StorageError(f"{path}: cannot be read ({error})") from error
-    if not isinstance(settings, dict):
-        raise storage.StorageError(f"{path}: it must be a table")
-    module = EXPERIMENTS[one_of(f"{path}: task", str(settings.get("task")), EXPERIMENTS)]
-    config = restored(module.Config, settings, str(path))
+    path, plain = folder / "config.json", settings.read(folder)
+    module = EXPERIMENTS[one_of(f"{path}: task", str(plain.get("task")), EXPERIMENTS)]
+    config = settings.restored(module.Config, plain, str(path))
     config.validate()
     task: pipeline.Task = module.make_task(config)
     subs = task.env.sub_rmdps(task.train)
     threats = config.threat or folder / "threat"
     models: dict | None = {}
-    used = [path, folder / "agent" / "arrays.npz"]
+    used = [path, folder / "agent" / "manifest.json"]  # these hold the checksums of the arrays
     if np.isinf(config.x):
         models = None
     elif subs:
         models = artefact.load(threats, task.name, subs)
-        used.append(threats / "arrays.npz")
+        used.append(threats / "manifest.json")
     pmdp = pipeline.make_pmdp(task, config, models, task.train)
     shapes = jax.eval_shape(
         lambda key: loop.init(key, pmdp, config.planning)[0].learner.params, jax.random.key(0)
     )
-    like = jax.tree.map(lambda s: np.zeros((config.seeds, *s.shape), s.dtype), shapes)
+    like = jax.tree.map(lambda s: jax.ShapeDtypeStruct((config.seeds, *s.shape), s.dtype), shapes)
     params = storage.load(folder / "agent", "Q-network", like)
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in used)).hexdigest()
     return Run(task, config, models, params, digest)
-
-
-def restored(kind: type, plain: Any, where: str) -> Any:
-    """A dataclass from what `storage.write_json` made of it. Fields not there keep their default.
-
-    Raises:
-        storage.StorageError: a value is not of its field's type.
-    """
-    if not isinstance(plain, Mapping):
-        raise storage.StorageError(f"{where}: it is {plain!r}; it must be a table")
-    types_of = typing.get_type_hints(kind)
-    names = [f.name for f in dataclasses.fields(kind) if f.name in plain]
-    return kind(**{n: _value(types_of[n], plain[n], f"{where}: {n}") for n in names})
-
-
-def _value(kind: Any, plain: Any, where: str) -> Any:
-    if dataclasses.is_dataclass(kind):
-        return restored(typing.cast(type, kind), plain, where)
-    options = typing.get_args(kind)
-    if isinstance(kind, types.UnionType):
-        return None if plain is None else _value(options[0], plain, where)
-    if typing.get_origin(kind) is tuple and isinstance(plain, list):
-        return tuple(_value(options[0], item, where) for item in plain)
-    if kind is float and plain in ("inf", "-inf"):
-        return float(plain)
-    if kind is float and isinstance(plain, int | float) and not isinstance(plain, bool):
-        return float(plain)
-    if kind is Path and isinstance(plain, str):
-        return Path(plain)
-    if kind in (int, bool, str) and type(plain) is kind:
-        return plain
-    name = getattr(kind, "__name__", kind)
-    raise storage.StorageError(f"{where} is {plain!r}; it must be of type {name}")

@@ -19,7 +19,7 @@ from experiments import cli, console, jam, pipeline, recipes, tables
 from rp_jax import evaluate, storage
 from rp_jax.adapters import brax
 from rp_jax.envs.base import Env, select
-from rp_jax.planning.pmdp import PMDP
+from rp_jax.planning.pmdp import PMDP, not_finite
 from rp_jax.threat.build import ThreatConfig
 from rp_jax.validate import number
 
@@ -107,7 +107,7 @@ def played(key: jax.Array, pmdp: PMDP, weights: Any, policy: Policy, discrete: b
     none, zeros = jnp.zeros(ROUND, bool), jnp.zeros(ROUND)
     kinds = jax.eval_shape(jax.vmap(pmdp.env.causes, (0, None)), state.pipeline_state, pmdp.params)
     causes = dict.fromkeys(kinds, none)
-    rows = evaluate.Episodes(zeros, zeros, none, zeros, zeros, zeros, causes)
+    rows = evaluate.Episodes(zeros, zeros, none, zeros, zeros, zeros, causes, zeros, zeros)
 
     def advance(carry):
         t, alive, state, rows = carry
@@ -121,6 +121,8 @@ def played(key: jax.Array, pmdp: PMDP, weights: Any, policy: Policy, discrete: b
             interventions=rows.interventions + reached.info.get("intervention", 0.0),
             insecure=rows.insecure + reached.info.get("insecure", 0.0),
             causes=jax.vmap(pmdp.env.causes, (0, None))(reached.pipeline_state, pmdp.params),
+            bad_observations=rows.bad_observations + not_finite(state.obs),
+            bad_threats=rows.bad_threats,  # the shield's own
         )
         keep = jax.vmap(select)
         ended = (reached.done + reached.info["truncation"]) > 0

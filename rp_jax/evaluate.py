@@ -12,6 +12,7 @@ from jax import Array
 from rp_jax import shield, statistics
 from rp_jax.envs.base import select
 from rp_jax.planning.pmdp import PMDP, Percept
+from rp_jax.validate import finite
 
 # Chooses for a batch of states: (key, percept) -> (actions (B,) or (B, 2), (B,) bool: these are
 # not the actions that it would have preferred).
@@ -28,6 +29,8 @@ class Episodes(NamedTuple):
     interventions: Array  # steps on which the mask changed the policy's own choice
     insecure: Array  # steps without an admissible action
     causes: dict[str, Array]  # bool, what was hit
+    bad_observations: Array  # steps on which a number was nan or infinite
+    bad_threats: Array  # likewise
 
 
 def greedy(network: nn.Module, weights: Any) -> Callable[[Percept], Array]:
@@ -85,7 +88,7 @@ def play_episodes(
         kinds = jax.eval_shape(jax.vmap(pmdp.env.causes, (0, None)), states, pmdp.params)
         causes = dict.fromkeys(kinds, none)
         count = jnp.zeros(batch, jnp.int32)
-        rows = Episodes(zeros, zeros, none, count, count, count, causes)
+        rows = Episodes(zeros, zeros, none, count, count, count, causes, count, count)
 
         def advance(carry):
             t, alive, states, rows = carry
@@ -95,6 +98,7 @@ def play_episodes(
             step = jax.vmap(pmdp.env.step, (0, 0, 0, None))
             reached, outcome = step(step_keys, states, action, pmdp.params)
             hit = jax.vmap(pmdp.env.causes, (0, None))(reached, pmdp.params)
+            bad_observation, bad_threat = percept.faults()
             new = Episodes(
                 score=rows.score + outcome.reward,
                 danger=rows.danger + outcome.danger,
@@ -103,6 +107,8 @@ def play_episodes(
                 interventions=rows.interventions + changed,
                 insecure=rows.insecure + ~percept.secure,
                 causes=jax.tree.map(jnp.logical_or, rows.causes, hit),
+                bad_observations=rows.bad_observations + bad_observation,
+                bad_threats=rows.bad_threats + bad_threat,
             )
             rows = jax.vmap(select)(alive, new, rows)
             return t + 1, alive & ~outcome.done, reached, rows
@@ -112,6 +118,16 @@ def play_episodes(
 
     rows = jax.lax.map(one_round, jax.random.split(key, rounds))
     return jax.tree.map(lambda a: a.reshape(-1)[:episodes], rows)
+
+
+def check(rows: Episodes, name: str) -> None:
+    """Raises FloatingPointError if an episode saw or earned what is not a finite number."""
+    for what in ("observations", "threats"):
+        count = int(np.sum(getattr(rows, f"bad_{what}")))
+        if count:
+            raise FloatingPointError(f"{name}: {what} of {count:,} steps are nan or infinite")
+    finite(f"{name}: returns", rows.score)
+    finite(f"{name}: dangers", rows.danger)
 
 
 def summarise(rows: Episodes, penalty: float) -> dict[str, Any]:

@@ -3,7 +3,9 @@
 import math
 import numbers
 from collections.abc import Iterable
-from typing import TypeVar
+from typing import Any, TypeVar
+
+import numpy as np
 
 T = TypeVar("T")
 
@@ -67,3 +69,12 @@ def positive(
 ) -> float:
     """Returns `value` if it is a number above 0 (and at most `most`), else raises ValueError."""
     return number(field, value, above=0, most=most, integer=integer)
+
+
+def finite(what: str, values: Any) -> None:
+    """Raises FloatingPointError if a number that was computed is nan or infinite."""
+    wrong = int(np.size(values) - np.isfinite(values).sum())
+    if wrong:
+        raise FloatingPointError(
+            f"{what}: {wrong:,} of {np.size(values):,} numbers are nan or infinite"
+        )

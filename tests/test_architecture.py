@@ -14,7 +14,7 @@ FOREIGN = ("brax", "matplotlib", "gymnasium")
 # one place in the line not from one another.
 ORDER = [
     {"validate", "storage", "devices", "kinematics"},
-    {"sensing", "statistics", "shield"},
+    {"sensing", "statistics", "shield", "checkpoints"},
     {"hazards"},
     {"envs"},
     {"recon"},

@@ -151,6 +151,8 @@ def made(score, danger, goal, length, interventions, insecure, pit):
         interventions=jnp.asarray(interventions),
         insecure=jnp.asarray(insecure),
         causes={"pit": jnp.asarray(pit, bool), "wall": jnp.zeros(len(score), bool)},
+        bad_observations=jnp.zeros(len(score)),
+        bad_threats=jnp.zeros(len(score)),
     )
 
 

@@ -19,6 +19,11 @@ def fail(*args, **kwargs):
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
+def arrays_of(folder):
+    (path,) = folder.glob("arrays-*.bin")
+    return path
+
+
 def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
@@ -178,7 +183,7 @@ def test_saving_again_replaces(tmp_path):
     storage.save(tmp_path, "thing", TREE, {})
     storage.save(tmp_path, "thing", {"a": jnp.ones(2)}, {})
     np.testing.assert_array_equal(storage.load(tmp_path, "thing", {"a": jnp.zeros(2)})["a"], 1)
-    assert names(tmp_path) == ["arrays.npz", "manifest.json"]
+    assert names(tmp_path) == [arrays_of(tmp_path).name, "manifest.json"]
 
 
 def test_leaves_are_named_by_their_paths():
@@ -206,25 +211,77 @@ def test_another_kind_is_refused(tmp_path):
         storage.load(tmp_path, "threat function", {"a": jnp.ones(2)})
 
 
-def test_every_flipped_byte_is_found(tmp_path):
-    like = {"a": jnp.ones(2)}
-    storage.save(tmp_path, "thing", like, {})
-    path = tmp_path / "arrays.npz"
-    good = path.read_bytes()
-    for i in range(0, len(good), 7):
-        path.write_bytes(good[:i] + bytes([good[i] ^ 1]) + good[i + 1 :])
-        with pytest.raises(StorageError, match=r"arrays\.npz: the checksum differs"):
-            storage.load(tmp_path, "thing", like)
-    path.write_bytes(good)
-    storage.load(tmp_path, "thing", like)
+SMALL = {"a": jnp.asarray([1.5, -2.0]), "key": jax.random.key(7)}
+
+
+def bits(tree):
+    return {name: a.tobytes() for name, a in storage.leaves(tree).items()}
+
+
+def damaged_or_right(folder):
+    """Loads what may be damaged: never anything but what was saved."""
+    try:
+        found = storage.load(folder, "thing", SMALL)
+        about = storage.read_manifest(folder, "thing")["about"]
+    except StorageError:
+        return False
+    assert bits(found) == bits(SMALL)
+    assert about == {"x": 0.25, "note": "here"}
+    return True
+
+
+def saved_small(folder):
+    storage.save(folder, "thing", SMALL, {"x": 0.25, "note": "here"})
+    assert damaged_or_right(folder)
+    return [arrays_of(folder), folder / "manifest.json"]
+
+
+def test_every_flipped_bit_is_found(tmp_path):
+    for path in saved_small(tmp_path):
+        good, unseen = path.read_bytes(), 0
+        for i in range(8 * len(good)):
+            flipped = bytearray(good)
+            flipped[i // 8] ^= 1 << i % 8
+            path.write_bytes(flipped)
+            unseen += damaged_or_right(tmp_path)
+        assert unseen <= good.count(b"\n") * (path.suffix == ".json")  # space for space
+        path.write_bytes(good)
+        assert damaged_or_right(tmp_path)
+
+
+def test_every_length_but_the_right_one_is_found(tmp_path):
+    for path in saved_small(tmp_path):
+        good = path.read_bytes()
+        for length in [*range(len(good)), len(good) + 1]:
+            path.write_bytes((good + b"x")[:length])
+            if damaged_or_right(tmp_path):  # the line's end after the manifest
+                assert (path.suffix, length) == (".json", len(good) - 1)
+        path.write_bytes(good)
+
+
+def test_nothing_is_read_for_a_forged_size(tmp_path, monkeypatch):
+    _, path = saved_small(tmp_path)
+    manifest = json.loads(path.read_text())
+    monkeypatch.setattr(Path, "read_bytes", lambda *_: pytest.fail("it was read"))
+    for shape in ([10**12], [2**62, 8], [-1], [2, 10**9], "2", None, [1.5]):
+        forged = json.loads(json.dumps(manifest))
+        forged["arrays"]["a"]["shape"] = shape
+        path.write_text(json.dumps({**forged, "seal": storage.seal(forged)}))
+        with pytest.raises(StorageError, match=r"a is .*; it must be"):
+            storage.load(tmp_path, "thing", SMALL)
+    for change in ({"bytes": 10**15}, {"bytes": None}, {"sha256": "../../x"}, {"sha256": 3}):
+        forged = {**manifest, **change}
+        path.write_text(json.dumps({**forged, "seal": storage.seal(forged)}))
+        with pytest.raises(StorageError, match="cannot be right"):
+            storage.load(tmp_path, "thing", SMALL)
 
 
 @pytest.mark.parametrize("keep", [0, 1, -1])
 def test_a_cut_file_is_found(keep, tmp_path):
     storage.save(tmp_path, "thing", {"a": jnp.ones(2)}, {})
-    path = tmp_path / "arrays.npz"
+    path = arrays_of(tmp_path)
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(StorageError, match=r"arrays\.npz: \d+ bytes; the manifest says \d+"):
+    with pytest.raises(StorageError, match=r"arrays-\w+\.bin: \d+ bytes; the manifest says \d+"):
         storage.load(tmp_path, "thing", {"a": jnp.ones(2)})
 
 
@@ -233,13 +290,14 @@ def test_a_cut_file_is_found(keep, tmp_path):
     [
         ("", "cannot be read"),
         ("{", "cannot be read"),
-        ("[]", "format is not 1"),
-        ("null", "format is not 1"),
-        ('{"format": 2}', "format is not 1"),
-        ('{"format": 1}', "kind is None"),
-        ('{"format": 1, "kind": "thing"}', "'about' and 'arrays' must be tables"),
-        ('{"format": 1, "kind": "thing", "about": {}, "arrays": []}', "must be tables"),
-        ('{"format": 1, "kind": "thing", "about": {}, "arrays": {}}', "the manifest says None"),
+        ("[]", "format is not 2"),
+        ("null", "format is not 2"),
+        ('{"format": 1}', "format is not 2"),
+        ('{"format": 2}', "kind is None"),
+        ('{"format": 2, "kind": "thing"}', "'about' and 'arrays' must be tables"),
+        ('{"format": 2, "kind": "thing", "about": {}, "arrays": []}', "must be tables"),
+        ('{"format": 2, "kind": "thing", "about": {}, "arrays": {}}', "differs from its seal"),
+        ("[" * 100_000, "cannot be read"),
         (b"\xff\xfe", "cannot be read"),
     ],
 )
@@ -254,8 +312,8 @@ def test_missing_files_are_named(tmp_path):
     with pytest.raises(StorageError, match=r"no manifest\.json; it is not a saved thing"):
         storage.load(tmp_path / "nowhere", "thing", {})
     storage.save(tmp_path, "thing", {"a": jnp.ones(2)}, {})
-    (tmp_path / "arrays.npz").unlink()
-    with pytest.raises(StorageError, match=r"arrays\.npz: cannot be read"):
+    arrays_of(tmp_path).unlink()
+    with pytest.raises(StorageError, match=r"arrays-\w+\.bin: cannot be read"):
         storage.load(tmp_path, "thing", {"a": jnp.ones(2)})
     (tmp_path / "manifest.json").unlink()
     (tmp_path / "manifest.json").mkdir()
@@ -272,11 +330,44 @@ def test_a_failed_save_leaves_the_old_one_whole(tmp_path, monkeypatch):
     np.testing.assert_array_equal(storage.load(tmp_path, "thing", {"a": jnp.zeros(2)})["a"], 1)
 
 
-def test_a_save_broken_off_between_its_files_is_found(tmp_path, monkeypatch):
-    storage.save(tmp_path, "thing", {"a": jnp.ones(2)}, {})
-    with monkeypatch.context() as patch:
-        patch.setattr(storage, "write_json", fail)
-        with pytest.raises(OSError, match="No space"):
-            storage.save(tmp_path, "thing", {"a": jnp.zeros(2)}, {})
-    with pytest.raises(StorageError, match="checksum"):
-        storage.load(tmp_path, "thing", {"a": jnp.zeros(2)})
+@pytest.mark.parametrize("name", ["open", "fdopen", "fsync", "chmod", "replace"])
+def test_whatever_call_fails_the_old_one_or_the_new_one_is_whole(name, tmp_path, monkeypatch):
+    folder = tmp_path / "thing"
+    saved_small(folder)
+    new = {"a": jnp.zeros(9)}
+    for n in range(1, 10):
+        saved_small(folder)
+        with monkeypatch.context() as patch:
+            patch.setattr(os, name, fails_at(n, getattr(os, name)))
+            try:
+                storage.save(folder, "thing", new, {})
+                break  # it calls it less often than that
+            except StorageError as error:
+                said = str(error)
+        assert "No space left on device" in said
+        if not damaged_or_right(folder):
+            assert bits(storage.load(folder, "thing", new)) == bits(new)
+    assert n > 1
+
+
+def fails_at(n, operation):
+    count = 0
+
+    def call(*args, **kwargs):
+        nonlocal count
+        count += 1
+        return fail() if count == n else operation(*args, **kwargs)
+
+    return call
+
+
+def test_keys_and_numpys_arrays_come_back_as_such(tmp_path):
+    tree = {"key": jax.random.split(jax.random.key(1), 3), "a": np.arange(3.0), "b": jnp.ones(2)}
+    storage.save(tmp_path, "thing", tree, {})
+    found = storage.load(tmp_path, "thing", tree)
+    assert found["key"].dtype == tree["key"].dtype
+    assert bits(found) == bits(tree)
+    assert isinstance(found["a"], np.ndarray)
+    found["a"][0] = 7.0  # it is one's own
+    shapes = {**tree, "b": jax.ShapeDtypeStruct((2,), jnp.float32)}
+    assert bits(storage.load(tmp_path, "thing", shapes)) == bits(tree)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import flashbax
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import linen as nn
 from jax import Array
@@ -17,8 +18,8 @@ from rp_jax.planning import dqn
 from rp_jax.planning.dqn import DQNConfig, Learner, Transition
 from rp_jax.planning.networks import NETWORKS
 from rp_jax.planning.nstep import Taken, n_step_transition
-from rp_jax.planning.pmdp import PMDP, Encoded
-from rp_jax.validate import number, one_of
+from rp_jax.planning.pmdp import PMDP, Encoded, not_finite
+from rp_jax.validate import finite, number, one_of
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,9 @@ class Metrics(NamedTuple):
     insecure: Array  # states without an admissible action
     inadmissible: Array  # actions taken whose threat exceeds x though others' did not
     loss: Array
+    bad_observations: Array  # states seen with a number that is nan or infinite
+    bad_threats: Array  # likewise
+    bad_rewards: Array  # steps
 
 
 class Seen(NamedTuple):
@@ -193,6 +197,9 @@ def interact(
         insecure=jnp.sum(jnp.min(state.seen.threat, axis=-1) > pmdp.x, dtype=score.dtype),
         inadmissible=jnp.sum(_inadmissible(state.seen.threat, action, pmdp.x), dtype=score.dtype),
         loss=jnp.zeros((), score.dtype),
+        bad_observations=jnp.sum(not_finite(state.seen.encoded.rest), dtype=score.dtype),
+        bad_threats=jnp.sum(not_finite(state.seen.threat), dtype=score.dtype),
+        bad_rewards=jnp.sum(~jnp.isfinite(taken.reward), dtype=score.dtype),
     )
     window = jax.tree.map(
         lambda old, new: jnp.concatenate([old[1:], new[None]]), state.window, taken
@@ -308,3 +315,17 @@ def chunk(
 
     state, metrics = jax.lax.scan(iteration, state, None, length=iterations)
     return state, jax.tree.map(lambda m: jnp.sum(m, axis=0), metrics)
+
+
+def check(params: Any, metrics: Metrics) -> None:
+    """Raises FloatingPointError if something in a chunk was not a finite number, naming it.
+
+    The weights tell of gradients: Adam never forgets one that is not finite.
+    """
+    for name in ("observations", "threats", "rewards"):
+        count = int(np.sum(getattr(metrics, f"bad_{name}")))
+        if count:
+            raise FloatingPointError(f"planning: {name} of {count:,} steps are nan or infinite")
+    finite("planning: losses", metrics.loss)
+    for leaf in jax.tree.leaves(params):
+        finite("planning: weights, after a gradient that was not,", leaf)

@@ -30,6 +30,15 @@ class Percept(NamedTuple):
     secure: Array  # (B,) bool
     threat: Array  # (B, A)
 
+    def faults(self) -> tuple[Array, Array]:
+        """(B,) bool each: the observation, or the threats, hold a number that is none."""
+        return not_finite(self.encoded.rest), not_finite(self.threat)
+
+
+def not_finite(values: Array) -> Array:
+    """(B, n) -> (B,) bool."""
+    return ~jnp.all(jnp.isfinite(values), axis=-1)
+
 
 class PMDP(struct.PyTreeNode):
     """Equation 10: the original MDP, restricted to the admissible actions.
@@ -91,6 +100,8 @@ class PMDP(struct.PyTreeNode):
 def encode(observation: Array, scan: int, pool: int) -> Encoded:
     """Splits an observation into its LIDAR, min-pooled and in bytes, and the rest.
 
+    Bytes know no nan: where the LIDAR holds a number that is none, the rest is nan.
+
     Args:
         observation: (n,) whose first `scan` values are distances in [0, 1], 0 for none.
         scan: number of LIDAR values.
@@ -98,4 +109,6 @@ def encode(observation: Array, scan: int, pool: int) -> Encoded:
     """
     distance = jnp.where(observation[:scan] == 0, 1.0, observation[:scan])
     nearest = jnp.min(distance.reshape(scan // pool, pool), axis=-1)
-    return Encoded(jnp.round(nearest * 255).astype(jnp.uint8), observation[scan:])
+    sound = jnp.all(jnp.isfinite(observation[:scan]))
+    rest = jnp.where(sound, observation[scan:], jnp.nan)
+    return Encoded(jnp.round(nearest * 255).astype(jnp.uint8), rest)

@@ -11,13 +11,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
 from jax.sharding import Mesh
 
 from rp_jax import devices
+from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
 from rp_jax.hazards import SubRMDP
 from rp_jax.kinematics import AgentModel, ControlDistribution, Plans
+from rp_jax.validate import finite
 
 
 class Labels(struct.PyTreeNode):
@@ -224,6 +227,7 @@ def label(
     rows: int = 8192,
     on_progress: Callable[[int, int], None] | None = None,
     mesh: Mesh | None = None,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> Labels:
     """Labels many states, leading axis (n,), `rows` to a call and `batch` side by side.
 
@@ -237,19 +241,31 @@ def label(
         rows: rows between two reports of progress.
         on_progress: called with (rows done, n).
         mesh: of devices that share the rows; None for one device.
+        checkpoints: of these labels.
+
+    Raises:
+        FloatingPointError: a label is not a finite number.
     """
     count = jax.tree.leaves(agent)[0].shape[0]
     rows = min(rows, count)
     rows += 0 if mesh is None else -rows % mesh.size
-    parts = []
-    for start in range(0, count, rows):
+    first = jax.tree.map(lambda a: a[0], (agent, hazard))
+    one = jax.eval_shape(estimator, key, *first, sub)
+
+    def step(i: int, found: Labels) -> Labels:
+        start = i * rows
         # The last call repeats rows, so that there is one shape and one compilation.
         index = jnp.minimum(start + jnp.arange(rows), count - 1)
-        take = lambda tree, index=index: jax.tree.map(lambda a: a[index], tree)  # noqa: E731
+        take = lambda tree: jax.tree.map(lambda a: a[index], tree)  # noqa: E731
         chunk = jax.random.fold_in(key, start)
-        found = _label(chunk, take(agent), take(hazard), sub, estimator, batch, mesh)
-        parts.append(devices.gather(found, mesh))
+        part = _label(chunk, take(agent), take(hazard), sub, estimator, batch, mesh)
+        part = devices.gather(part, mesh)
+        for whole, new in zip(jax.tree.leaves(found), jax.tree.leaves(part), strict=True):
+            whole[start : start + rows] = new[: count - start]
+        finite("labels", found.threat[start : start + rows])
         if on_progress:
-            jax.block_until_ready(parts[-1])
             on_progress(min(start + rows, count), count)
-    return jax.tree.map(lambda *a: jnp.concatenate(a)[:count], *parts)
+        return found
+
+    blank = jax.tree.map(lambda s: np.zeros((count, *s.shape), s.dtype), one)
+    return jax.tree.map(jnp.asarray, checkpoints.loop(blank, step, -(-count // rows)))

@@ -74,7 +74,7 @@ def load(folder: Path, environment: str, subs: Mapping[str, SubRMDP]) -> dict[st
 
 
 def _blank(folder: Path, kind: str, facts: Any, sub: SubRMDP) -> ThreatModel:
-    """A model of the right structure, whose arrays are to be replaced."""
+    """A model of the right structure, with the shapes of its weights."""
     hidden = facts.get("hidden") if isinstance(facts, dict) else None
     if (
         not isinstance(hidden, list)
@@ -95,6 +95,4 @@ def _blank(folder: Path, kind: str, facts: Any, sub: SubRMDP) -> ThreatModel:
         lambda key: sub.source.features(*sub.source.sample(key, sub.agent)), jax.random.key(0)
     )
     shapes = jax.eval_shape(network.init, jax.random.key(0), features)
-    params = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), shapes)
-    scale = jnp.zeros(features.shape, features.dtype)
-    return ThreatModel(sub.source, params, scale, jnp.zeros(()), network)
+    return ThreatModel(sub.source, shapes, features, jnp.zeros(()), network)

@@ -13,12 +13,13 @@ from jax import Array
 from jax.sharding import Mesh
 
 from rp_jax import statistics
+from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
 from rp_jax.hazards import SubRMDP
 from rp_jax.recon import labels, sampling
 from rp_jax.threat import fit, report
 from rp_jax.threat.fit import Dataset, FitConfig
 from rp_jax.threat.model import ThreatModel
-from rp_jax.validate import number, one_of
+from rp_jax.validate import finite, number, one_of
 
 Progress = Callable[[str, int, int], None]  # (stage, done, total)
 SAMPLINGS = ("uniform", "preferential")
@@ -58,10 +59,13 @@ class Built(NamedTuple):
     seconds: dict[str, float]  # labels, fit, report
 
 
-def _labelled(key, features, sub, estimator, stage, on_progress, mesh) -> Dataset:
+def _labelled(key, features, sub, estimator, stage, on_progress, mesh, checkpoints) -> Dataset:
     agent, hazard = jax.vmap(sub.source.state_of)(features)
     watch = (lambda done, total: on_progress(stage, done, total)) if on_progress else None
-    found = labels.label(key, agent, hazard, sub, estimator, on_progress=watch, mesh=mesh)
+    at = checkpoints.at(stage)
+    found = labels.label(
+        key, agent, hazard, sub, estimator, on_progress=watch, mesh=mesh, checkpoints=at
+    )
     return Dataset(features, found.threat)
 
 
@@ -75,31 +79,42 @@ def fitted(
     config: FitConfig,
     on_progress: Progress | None = None,
     chunks: int = 20,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> tuple[ThreatModel, list[dict[str, float]]]:
-    """Fits a model to labelled states and their mirror images; returns it and its curve."""
+    """Fits a model to labelled states and their mirror images; returns it and its curve.
+
+    Raises:
+        FloatingPointError: the loss, or a weight after a step, is not a finite number.
+    """
     split_key, init_key = jax.random.split(key)
     train, held = fit.split(split_key, data, config.validation)
     train = fit.mirror(train, sub)
     model, state = fit.init(init_key, sub, train, config)
     length = max(1, config.steps // chunks)
     config = dataclasses.replace(config, steps=length * chunks)
-    curve = []
-    for i in range(chunks):
-        state, loss = _run(model, state, train, config=config, steps=length)
-        now = model.replace(params=state.params)
-        logits = now.logits(held.features)
+
+    def step(i: int, carried: tuple[fit.FitState, np.ndarray]) -> tuple[fit.FitState, np.ndarray]:
+        state, losses = _run(model, carried[0], train, config=config, steps=length)
+        finite("fit: losses", losses)
+        finite("fit: weights", np.concatenate([np.ravel(a) for a in jax.tree.leaves(state.params)]))
+        logits = model.replace(params=state.params).logits(held.features)
         error = jnp.mean(jnp.abs(jax.nn.sigmoid(logits) - held.threat))
-        curve.append(
-            {
-                "step": (i + 1) * length,
-                "loss": float(jnp.mean(loss)),
-                "validation_loss": float(fit.cross_entropy(logits, held.threat)),
-                "validation_mae": float(error),
-            }
-        )
+        validation_loss = fit.cross_entropy(logits, held.threat)
+        carried[1][i] = [jnp.mean(losses), validation_loss, error]
         if on_progress:
             on_progress("fit", (i + 1) * length, config.steps)
-    return model.replace(params=state.params), curve
+        return state, carried[1]
+
+    blank = np.zeros((chunks, 3), held.threat.dtype)
+    params, points = checkpoints.loop(
+        (state, blank), step, chunks, lambda carried: (carried[0].params, carried[1])
+    )
+    names = ("loss", "validation_loss", "validation_mae")
+    curve = [
+        {"step": (i + 1) * length, **dict(zip(names, point, strict=True))}
+        for i, point in enumerate(points.tolist())
+    ]
+    return model.replace(params=params), curve
 
 
 class Calibration(NamedTuple):
@@ -163,6 +178,7 @@ def build(
     x: float,
     on_progress: Progress | None = None,
     mesh: Mesh | None = None,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> Built:
     """Learns the threat function of one kind of hazard.
 
@@ -174,6 +190,10 @@ def build(
             and prudence look closely.
         on_progress: told how far each stage is.
         mesh: of devices that share the rollouts; None for one device.
+        checkpoints: of its labels and fits.
+
+    Raises:
+        FloatingPointError: a label, a loss or a weight is not a finite number.
     """
     keys = jax.random.split(key, 9)
     estimator = labels.best_estimator(sub, config.paths)
@@ -181,29 +201,34 @@ def build(
     began = time.perf_counter()
     first = config.states // 2 if config.sampling == "preferential" else config.states
     features = sampling.uniform(keys[0], sub, first)
-    data = _labelled(keys[1], features, sub, estimator, "labels", on_progress, mesh)
+    at = checkpoints.at
+    data = _labelled(keys[1], features, sub, estimator, "labels", on_progress, mesh, checkpoints)
     if config.sampling == "preferential":
         short = dataclasses.replace(config.fit, steps=config.fit.steps // 4)
-        scout, _ = fitted(keys[2], sub, data, short, on_progress)
+        scout, _ = fitted(keys[2], sub, data, short, on_progress, checkpoints=at("scout"))
         more = sampling.preferential(
             keys[3], sub, scout, data.features, data.threat, x, config.states - first
         )
-        extra = _labelled(keys[4], more, sub, estimator, "labels", on_progress, mesh)
+        extra = _labelled(
+            keys[4], more, sub, estimator, "more labels", on_progress, mesh, checkpoints
+        )
         data = Dataset(*map(jnp.concatenate, zip(data, extra, strict=True)))
     jax.block_until_ready(data)
     labelled = time.perf_counter()
-    model, curve = fitted(keys[5], sub, data, config.fit, on_progress)
+    model, curve = fitted(keys[5], sub, data, config.fit, on_progress, checkpoints=at("fit"))
     facts = {}
     if config.prudence < 1:
         hard = near_threshold(keys[8], sub, model, x, config.test_states)
-        checked = _labelled(keys[6], hard, sub, accurate, "calibration", on_progress, mesh)
+        checked = _labelled(
+            keys[6], hard, sub, accurate, "calibration", on_progress, mesh, checkpoints
+        )
         rate, confidence = config.prudence, config.confidence
         model, known = calibrated(model, checked, x, rate, confidence)
         facts = {"calibration": known._asdict()}
     fitted_at = time.perf_counter()
     fresh_key, test_key = jax.random.split(keys[7])
     fresh = sampling.uniform(fresh_key, sub, config.test_states)
-    test = _labelled(test_key, fresh, sub, accurate, "report", on_progress, mesh)
+    test = _labelled(test_key, fresh, sub, accurate, "report", on_progress, mesh, checkpoints)
     found = report.compare(np.asarray(report.predict(model, fresh)), np.asarray(test.threat), x)
     seconds = {
         "labels": labelled - began,

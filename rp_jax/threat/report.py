@@ -9,6 +9,7 @@ from jax import Array
 from scipy import stats
 
 from rp_jax import statistics
+from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
 from rp_jax.envs.base import Hazards
 from rp_jax.recon import labels
 from rp_jax.threat.model import ThreatModel
@@ -52,7 +53,12 @@ def predict(model: ThreatModel, features: Array) -> Array:
 
 
 def labelled_sum(
-    key: Array, agents: Any, hazards: Hazards, sub: Any, estimator: labels.Estimator
+    key: Array,
+    agents: Any,
+    hazards: Hazards,
+    sub: Any,
+    estimator: labels.Estimator,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> np.ndarray:
     """(B, A) sum over hazards of their estimated threats: what a model's sum should be.
 
@@ -62,6 +68,7 @@ def labelled_sum(
         hazards: of one kind, leading axes (B, n).
         sub: their sub-R-MDP.
         estimator: labels a single (agent, hazard).
+        checkpoints: of the labels.
     """
     reached = np.asarray(_reached(agents, hazards, sub))
     row, column = np.nonzero(reached)
@@ -69,7 +76,7 @@ def labelled_sum(
     if len(row):
         agent = jax.tree.map(lambda a: a[row], agents)
         hazard = jax.tree.map(lambda a: a[row, column], hazards.state)
-        found = labels.label(key, agent, hazard, sub, estimator)
+        found = labels.label(key, agent, hazard, sub, estimator, checkpoints=checkpoints)
         np.add.at(total, row, np.asarray(found.threat, float))
     return total
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import pytest
 
 from experiments import circuit, cli, jam, pipeline, point_gather
+from rp_jax import storage
 from rp_jax.threat import artefact
 from rp_jax.threat.model import ThreatModel, ThreatNetwork
 
@@ -172,17 +173,18 @@ def test_threats_that_do_not_fit_are_named(refused, tmp_path):
 
 def test_damaged_threats_are_named(refused, tmp_path):
     save_threat(tmp_path / "good", "circuit")
-    arrays, manifest = tmp_path / "good" / "arrays.npz", tmp_path / "good" / "manifest.json"
+    (arrays,) = (tmp_path / "good").glob("arrays-*.bin")
+    manifest = tmp_path / "good" / "manifest.json"
     data = arrays.read_bytes()
     arrays.write_bytes(data[:500] + bytes([data[500] ^ 1]) + data[501:])
-    says = "arrays.npz: the checksum differs"
+    says = ".bin: the checksum differs"
     refused("circuit", "--threat", "good", says=says, keeps=["good"])
     arrays.write_bytes(data[:-1])
     refused("circuit", "--threat", "good", says="the manifest says", keeps=["good"])
     arrays.write_bytes(data)
     facts = json.loads(manifest.read_text())
     facts["about"]["networks"]["wall"]["hidden"] = [10**9]
-    manifest.write_text(json.dumps(facts))
+    manifest.write_text(json.dumps({**facts, "seal": storage.seal(facts)}))
     refused("circuit", "--threat", "good", says="hidden is [1000000000]", keeps=["good"])
     manifest.write_text("{")
     refused("circuit", "--threat", "good", says="manifest.json: cannot be read", keeps=["good"])
@@ -219,9 +221,10 @@ def prepared(tmp_path, monkeypatch):
 
     def settings(name, *argv):
         folder = call(name, *argv)
-        (_, config, preset, out) = calls.pop()
+        (_, config, out, checkpoints) = calls.pop()
         assert out == folder
-        return config, preset, folder
+        assert not checkpoints.folder.exists()  # the run is over
+        return config, json.loads((folder / "config.json").read_text())["preset"], folder
 
     return settings
 

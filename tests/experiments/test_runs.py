@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tiny import programs_of_a_moment  # noqa: F401
 
-from experiments import certify, circuit, jam, pipeline, rare, runs
+from experiments import certify, circuit, jam, pipeline, rare, runs, settings
 from rp_jax import evaluate, storage
 from rp_jax.envs.tracks import circle_plan
 from rp_jax.planning import loop
@@ -23,7 +23,7 @@ def test_settings_come_back_as_they_were_written(module, recipe, tmp_path):
     config = dataclasses.replace(module.full(recipe), x=float("inf"), threat=Path("a/b"))
     storage.write_json(tmp_path / "config.json", dataclasses.asdict(config))
     plain = json.loads((tmp_path / "config.json").read_text())
-    assert runs.restored(module.Config, plain, "file") == config
+    assert settings.restored(module.Config, plain, "file") == config
 
 
 @pytest.mark.parametrize(
@@ -40,9 +40,9 @@ def test_settings_come_back_as_they_were_written(module, recipe, tmp_path):
 )
 def test_settings_of_the_wrong_type_are_named(field, value, kind):
     with pytest.raises(storage.StorageError, match=rf"file: {field} is .*{kind}"):
-        runs.restored(jam.Config, {field: value}, "file")
+        settings.restored(jam.Config, {field: value}, "file")
     with pytest.raises(storage.StorageError, match="must be a table"):
-        runs.restored(jam.Config, {"planning": 3}, "file")
+        settings.restored(jam.Config, {"planning": 3}, "file")
 
 
 def test_a_run_comes_back_with_the_agents_that_its_table_speaks_of(finished):
@@ -70,12 +70,12 @@ def test_the_hash_speaks_of_settings_agents_and_threats(finished, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(finished, copy)
     assert runs.load(copy).sha256 == runs.load(finished).sha256
-    settings = json.loads((copy / "config.json").read_text())
-    storage.write_json(copy / "config.json", {**settings, "x": 0.8})
+    plain = json.loads((copy / "config.json").read_text())
+    storage.write_json(copy / "config.json", {**plain, "x": 0.8})
     assert runs.load(copy).sha256 != runs.load(finished).sha256
 
 
-@pytest.mark.parametrize("missing", ["config.json", "agent/arrays.npz", "threat/manifest.json"])
+@pytest.mark.parametrize("missing", ["config.json", "agent/manifest.json", "threat/manifest.json"])
 def test_a_run_with_something_missing_is_refused(missing, finished, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(finished, copy)

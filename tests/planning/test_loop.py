@@ -230,7 +230,7 @@ def test_no_key_is_used_twice(monkeypatch):
 
     def act(key, state, *_):
         note(key)
-        return state, loop.Metrics(*[0.0] * 9)
+        return state, loop.Metrics(*[0.0] * 12)
 
     def learn(key, state, *_):
         note(key)

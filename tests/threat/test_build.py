@@ -52,9 +52,9 @@ def built(env, kind, way):
     config = dataclasses.replace(TINY, states=states, sampling=way, prudence=prudence)
     told, fitted = [], build.fitted
 
-    def spy(key, sub, data, *rest):
+    def spy(key, sub, data, *rest, **more):
         FITTED.setdefault((env, way), []).append(data)
-        return fitted(key, sub, data, *rest)
+        return fitted(key, sub, data, *rest, **more)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(build, "fitted", spy)

@@ -1,0 +1,104 @@
+"""Long runs: does memory grow, is anything compiled again, is an inadmissible action ever taken?
+
+python -m benchmarks.endurance --minutes 120
+python -m benchmarks.endurance --steps 100000000
+"""
+
+import dataclasses
+import resource
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+import tyro
+
+from benchmarks import setups
+from experiments import console
+from rp_jax import storage
+from rp_jax.planning import loop
+from rp_jax.planning.pmdp import PMDP
+from rp_jax.validate import number, one_of
+
+CHUNK = 200  # iterations
+
+
+@dataclass(frozen=True)
+class Config:
+    """How long; the first of the two that is reached ends it."""
+
+    minutes: float = 2.0
+    steps: int = 100_000_000  # of the environment, shielded, while learning
+    env: str = "jam"  # or circuit
+    out: Path | None = None  # file for what was measured
+
+
+def memory() -> float:
+    """MB of this process in memory now; the most so far, where the system tells no more."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        (line,) = [line for line in status.read_text().splitlines() if line.startswith("VmRSS")]
+        return int(line.split()[1]) / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def train(config: Config) -> Iterator[dict[str, float]]:
+    """One row per chunk: minutes, steps, inadmissible actions, memory, and traces so far.
+
+    Raises:
+        FloatingPointError: something is no longer a finite number.
+    """
+    task, settings = setups.tasks()[config.env]
+    pmdp = setups.pmdp_of(task, settings)
+    learning = dataclasses.replace(settings.planning, steps=config.steps)
+    traces = 0
+
+    def counted(state: loop.LoopState, pmdp: PMDP) -> tuple[loop.LoopState, loop.Metrics]:
+        nonlocal traces
+        traces += 1
+        return loop.chunk(state, pmdp, learning, CHUNK)
+
+    chunk = jax.jit(counted, donate_argnums=0)
+    init = jax.jit(lambda key, pmdp: loop.init(key, pmdp, learning))
+    state, metrics = init(jax.random.key(0), pmdp)
+    began, steps, wrong = time.monotonic(), 0, 0
+    while steps < config.steps and time.monotonic() - began < 60 * config.minutes:
+        steps += int(metrics.steps)
+        wrong += int(metrics.inadmissible)
+        state, metrics = chunk(state, pmdp)
+        loop.check(state.learner.params, jax.tree.map(np.asarray, metrics))
+        yield {
+            "minutes": (time.monotonic() - began) / 60,
+            "steps": steps + int(metrics.steps),
+            "inadmissible": wrong + int(metrics.inadmissible),
+            "megabytes": memory(),
+            "traces": traces,
+        }
+
+
+def main() -> None:
+    """Exits with 1 if an inadmissible action was taken or something was compiled again."""
+    config = tyro.cli(Config, prog="python -m benchmarks.endurance", description=__doc__)
+    one_of("env", config.env, setups.tasks())
+    number("minutes", config.minutes, above=0)
+    number("steps", config.steps, least=1, integer=True)
+    rows = []
+    for row in train(config):
+        rows.append(row)
+        if len(rows) % 50 == 1:
+            console.say("  ".join(f"{name} {value:,.6g}" for name, value in row.items()))
+    half = [row for row in rows if row["minutes"] > rows[-1]["minutes"] / 2]
+    hours = (half[-1]["minutes"] - half[0]["minutes"]) / 60
+    growth = half[-1]["megabytes"] - half[0]["megabytes"]
+    found = {**rows[-1], "growth_in_second_half": growth, "hours_of_second_half": hours}
+    console.say("  ".join(f"{name} {value:,.6g}" for name, value in found.items()))
+    if config.out is not None:
+        storage.write_json(config.out, found)
+    if found["inadmissible"] or found["traces"] > 1:
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,109 @@
+"""config.json of a run: written at its beginning, read back to use or to resume the run."""
+
+import dataclasses
+import hashlib
+import json
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import rp_jax
+from experiments import console
+from rp_jax import storage
+from rp_jax.checkpoints import Checkpoints
+
+CHECKPOINTS = "checkpoints"  # folder inside that of a run, until the run is finished
+
+
+def machine() -> dict[str, Any]:
+    """What must not change for a run to be resumed to the same bits."""
+    versions = {"rp_jax": rp_jax.__version__, "jax": jax.__version__}
+    return {"versions": versions, "device": str(jax.devices()[0])}
+
+
+def begin(folder: Path, experiment: str, settings: Mapping[str, Any]) -> Checkpoints:
+    """Writes config.json of a new run of an experiment."""
+    (folder / CHECKPOINTS).mkdir()
+    plain = {"experiment": experiment, **settings, **machine()}
+    storage.write_json(folder / "config.json", plain)
+    return checkpoints_of(folder)
+
+
+def checkpoints_of(folder: Path) -> Checkpoints:
+    """Those of a run that has begun; they hold for its config.json alone."""
+    digest = hashlib.sha256((folder / "config.json").read_bytes()).hexdigest()
+    return Checkpoints(folder / CHECKPOINTS, run=digest, say=console.say)
+
+
+def read(folder: Path) -> dict[str, Any]:
+    """config.json.
+
+    Raises:
+        storage.StorageError: it is missing or unreadable.
+    """
+    path = folder / "config.json"
+    try:
+        settings = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        raise storage.StorageError(f"{path}: cannot be read ({error})") from error
+    if not isinstance(settings, dict):
+        raise storage.StorageError(f"{path}: it must be a table")
+    return settings
+
+
+def interrupted(folder: Path, experiment: str) -> dict[str, Any]:
+    """config.json of a run that an experiment can go on with here.
+
+    Raises:
+        ValueError: it is no run, it is finished, or was begun by something else or elsewhere.
+    """
+    settings = read(folder)
+    if not (folder / CHECKPOINTS).is_dir():
+        raise ValueError(
+            f"resume is {folder}; it must be an interrupted run, but there are no checkpoints: "
+            "it is finished"
+        )
+    for name, here in {"experiment": experiment, **machine()}.items():
+        if settings.get(name) != here:
+            raise ValueError(
+                f"resume is {folder}; its {name} is {settings.get(name)}; it must be {here} to "
+                "come to the same bits"
+            )
+    return settings
+
+
+def restored(kind: type, plain: Any, where: str) -> Any:
+    """A dataclass from what `storage.write_json` made of it. Fields not there keep their default.
+
+    Raises:
+        storage.StorageError: a value is not of its field's type.
+    """
+    if not isinstance(plain, Mapping):
+        raise storage.StorageError(f"{where}: it is {plain!r}; it must be a table")
+    types_of = typing.get_type_hints(kind)
+    names = [f.name for f in dataclasses.fields(kind) if f.name in plain]
+    return kind(**{n: _value(types_of[n], plain[n], f"{where}: {n}") for n in names})
+
+
+def _value(kind: Any, plain: Any, where: str) -> Any:
+    if dataclasses.is_dataclass(kind):
+        return restored(typing.cast(type, kind), plain, where)
+    options = typing.get_args(kind)
+    if isinstance(kind, types.UnionType):
+        return None if plain is None else _value(options[0], plain, where)
+    if typing.get_origin(kind) is tuple and isinstance(plain, list):
+        return tuple(_value(options[0], item, where) for item in plain)
+    if kind is float and plain in ("inf", "-inf"):
+        return float(plain)
+    if kind is float and isinstance(plain, int | float) and not isinstance(plain, bool):
+        return float(plain)
+    if kind is Path and isinstance(plain, str):
+        return Path(plain)
+    if kind in (int, bool, str) and type(plain) is kind:
+        return plain
+    name = getattr(kind, "__name__", kind)
+    raise storage.StorageError(f"{where} is {plain!r}; it must be of type {name}")

@@ -1,0 +1,118 @@
+"""Input made at random: a clear error or a good run, never a traceback, and nothing begun.
+
+RP_FUZZ sets the number of examples of the slow part.
+"""
+
+import itertools
+import json
+import os
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from experiments import circuit, cli, jam, pipeline, point_gather
+from experiments import settings as kept
+from rp_jax import storage
+
+MODULES = {"circuit": circuit, "jam": jam, "point_gather": point_gather}
+MANY = int(os.environ.get("RP_FUZZ", "100"))  # 10,000 take an hour or so
+
+VALUES = "0 1 -1 2.5 nan inf -inf 1e400 1e-400 True None quick paper plans"
+NAMES = (
+    "seeds seed out threat x learning-penalty learning-toll penalty episodes figures fidelity "
+    "baseline obstacles test-obstacles track test-tracks bombs preset recipe resume wall.states "
+    "wall.paths wall.sampling wall.prudence wall.fit.hidden wall.fit.steps wall.fit.validation "
+    "planning.steps planning.num-envs planning.batch planning.replay planning.replay-start "
+    "planning.n-step planning.learner.gamma planning.learner.period planning.network"
+)
+FIELDS = "seeds seed x out threat penalty episodes figures planning wall test_obstacles fidelity"
+
+values = st.one_of(
+    st.sampled_from(VALUES.split()),
+    st.integers().map(str),
+    st.floats().map(str),
+    st.text(st.characters(exclude_categories=["Cs"]), max_size=8),
+)
+options = st.tuples(st.sampled_from(NAMES.split()).map("--{}".format), values).map(list)
+stray = values.map(lambda value: [value])
+words = st.lists(options | stray, max_size=3).map(lambda parts: [*itertools.chain(*parts)])
+experiments = st.sampled_from(sorted(MODULES))
+plain = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner),
+    max_leaves=5,
+)
+changes = st.dictionaries(st.sampled_from(FIELDS.split()), plain)
+
+
+class BegunError(Exception):
+    """The input was good."""
+
+
+@pytest.fixture(scope="module")
+def nothing_runs(tmp_path_factory):
+    """Good input ends before anything is written."""
+
+    def begin(*args):
+        raise BegunError
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("fuzz"))
+        patch.setattr(storage, "new_folder", begin)
+        patch.setattr(pipeline, "run", begin)
+        yield
+
+
+def call(name, argv):
+    module = MODULES[name]
+    with pytest.raises((BegunError, SystemExit)) as stop:
+        cli.main(name, module.__doc__, module.PRESETS, module.make_task, argv)
+    helped = "--help" in argv or "-h" in argv
+    assert stop.type is BegunError or stop.value.code == 2 or helped
+
+
+class TestCommandLines:
+    @given(experiments, words)
+    @settings(max_examples=40)
+    def test_some(self, nothing_runs, name, argv):
+        call(name, argv)
+
+    @pytest.mark.slow
+    @given(experiments, words)
+    @settings(max_examples=MANY)
+    def test_many(self, nothing_runs, name, argv):
+        call(name, argv)
+
+
+def read_back(name, changed):
+    module = MODULES[name]
+    try:
+        config = kept.restored(module.Config, changed, "config.json")
+        pipeline.checked(module.make_task, config)
+    except ValueError:
+        pass  # anything else is a failure
+
+
+class TestSettingsReadBack:
+    @given(experiments, changes)
+    @settings(max_examples=40)
+    def test_some(self, name, changed):
+        read_back(name, changed)
+
+    @pytest.mark.slow
+    @given(experiments, changes)
+    @settings(max_examples=MANY)
+    def test_many(self, name, changed):
+        read_back(name, changed)
+
+
+@given(value=plain)
+def test_manifests_of_anything_are_refused(value, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("manifest")
+    for text in (value, {"format": storage.FORMAT, "kind": "thing", "about": {}, "arrays": value}):
+        if isinstance(text, dict):
+            text = {**text, "seal": storage.seal(text)}
+        (folder / "manifest.json").write_text(json.dumps(text))
+        with pytest.raises(storage.StorageError):
+            storage.load(folder, "thing", {"a": 1.0})

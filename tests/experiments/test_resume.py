@@ -1,0 +1,87 @@
+"""--resume: what it refuses, and a run that goes on where it was stopped."""
+
+import dataclasses
+import json
+
+import jax
+import killed
+import pytest
+from tiny import programs_of_a_moment  # noqa: F401
+
+from experiments import cli, settings
+from rp_jax import checkpoints, evaluate, storage
+
+
+def call(*argv, name="killed"):
+    presets, make_task = killed.corridor()
+    return cli.main(name, killed.__doc__, presets, make_task, [str(word) for word in argv])
+
+
+@pytest.fixture
+def begun(tmp_path):
+    """A run that was stopped at its very beginning."""
+    presets, _ = killed.corridor()
+    folder = tmp_path / "run"
+    folder.mkdir()
+    plain = {"preset": "quick", "task": "corridor", **dataclasses.asdict(presets["quick"]("tuned"))}
+    settings.begin(folder, "killed", plain)
+    return folder
+
+
+def refused(capsys, says, *argv, **more):
+    with pytest.raises(SystemExit) as stop:
+        call(*argv, **more)
+    assert stop.value.code == 2
+    assert says in " ".join(capsys.readouterr().out.split())
+
+
+def test_no_other_option_goes_with_it(begun, capsys):
+    says = "no other option may be given with it"
+    refused(capsys, says, "--resume", begun, "--seeds", "2")
+    refused(capsys, says, "--x", "0.1", "--resume", begun)
+    refused(capsys, says, "--preset", "quick", f"--resume={begun}")
+
+
+def test_what_is_no_interrupted_run_is_refused(begun, capsys, tmp_path):
+    refused(capsys, "config.json: cannot be read", "--resume", tmp_path / "nowhere")
+    (begun / "checkpoints").rmdir()
+    refused(capsys, "there are no checkpoints: it is finished", "--resume", begun)
+
+
+@pytest.mark.parametrize("change", [{"versions": {"jax": "0.1"}}, {"device": "TPU_0"}])
+def test_a_run_begun_elsewhere_is_refused(change, begun, capsys):
+    path = begun / "config.json"
+    storage.write_json(path, {**json.loads(path.read_text()), **change})
+    refused(capsys, f"its {next(iter(change))} is", "--resume", begun)
+
+
+def test_a_run_of_another_experiment_is_refused(begun, capsys):
+    refused(capsys, "its experiment is killed; it must be other", "--resume", begun, name="other")
+
+
+@pytest.mark.slow
+def test_a_run_stopped_by_nan_goes_on_to_the_same_bits(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(checkpoints, "INTERVAL", 0.0)
+    monkeypatch.setattr(checkpoints, "SHARE", float("inf"))
+    with jax.numpy_rank_promotion("allow"):
+        alone = call("--out", tmp_path / "alone")
+        folder = tmp_path / "run"
+        check = evaluate.check
+
+        def fails(rows, name):
+            if name == "slip 0.3":
+                raise FloatingPointError("slip 0.3: threats of 7 steps are nan or infinite")
+            check(rows, name)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(evaluate, "check", fails)
+            with pytest.raises(SystemExit) as stop:
+                call("--out", folder)
+        assert stop.value.code == 1
+        said = " ".join(capsys.readouterr().out.split())
+        assert "error: slip 0.3: threats of 7 steps" in said
+        assert f"to go on: python -m killed --resume {folder}" in said
+        assert killed.stage(folder) == "evaluation"
+        assert call("--resume", folder) == folder
+    assert killed.outcome(folder) == killed.outcome(alone)
+    assert not (folder / "checkpoints").exists()
