@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from rp_jax.envs import base
-from rp_jax.hazards import SubRMDP, WallPoint, Window
+from rp_jax.hazards import Reach, SubRMDP, WallPoint
 from rp_jax.kinematics import AgentModel, Control, ControlDistribution, Vehicle, make_vehicle
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.threat.model import ThreatModel, ThreatNetwork
@@ -49,10 +49,12 @@ def moves(ways):
 def make_params(slip=0.1, bait=3.0, time_limit=12):
     idle = ControlDistribution(controls=moves([0.0]), probabilities=jnp.ones(1))
     agent = Walker(moves([0.0, -1.0, 1.0]), idle, speeds=jnp.zeros(1), delayed=False)
-    window = Window(lower=jnp.asarray([-2.5, -1.0]), upper=jnp.asarray([2.5, 1.0]))
+    cells = jnp.asarray([-1.0, 1.0])  # a step
+    straight = jnp.asarray([[1.0, 0.0], [1.0, 0.0]])
+    reach = Reach(limits=cells, change=jnp.full(2, jnp.inf), swing=straight)
     return Params(
         agent=agent,
-        pit=WallPoint(radius=jnp.asarray(0.5), window=window, horizon=2),
+        pit=WallPoint(radius=jnp.asarray(0.5), reach=reach, horizon=2),
         slip=jnp.asarray(slip, float),
         bait=jnp.asarray(bait, float),
         time_limit=jnp.asarray(time_limit, jnp.int32),

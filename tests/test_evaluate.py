@@ -27,7 +27,7 @@ def narrow():
     wall = model.replace(
         source=params.wall, params={"params": {"Dense_0": weights}}, network=network
     )
-    return probe.make_pmdp(circuit, params, 0.4, models={"wall": wall})
+    return probe.make_pmdp(circuit, params, 0.3, models={"wall": wall})
 
 
 def scatter(rest, actions):
