@@ -32,7 +32,9 @@ class Percept(NamedTuple):
 
     def faults(self) -> tuple[Array, Array]:
         """(B,) bool each: the observation, or the threats, hold a number that is none."""
-        return not_finite(self.encoded.rest), not_finite(self.threat)
+        seen = [leaf for leaf in jax.tree.leaves(self.encoded) if leaf.dtype.kind == "f"]
+        bad = [not_finite(leaf.reshape(len(leaf), -1)) for leaf in seen]
+        return jnp.any(jnp.stack(bad), axis=0), not_finite(self.threat)
 
 
 def not_finite(values: Array) -> Array:
