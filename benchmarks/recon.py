@@ -40,17 +40,16 @@ def row(name: str, sub: SubRMDP, estimator: labels.Estimator, batch: int) -> Row
     """Labelled states per second, all actions of each."""
     key = jax.random.key(0)
 
-    def program(key, agent, hazard, sub, rows):
-        return labels.label(key, agent, hazard, sub, estimator, batch=ROWS, rows=rows)
+    def program(key, agent, hazard, sub):
+        return labels.label_rows(key, agent, hazard, sub, estimator, ROWS)
 
     def made(count: int) -> tuple[Any, ...]:
         features = sampling.uniform(key, sub, count)
         return (key, *jax.vmap(sub.source.state_of)(features), sub)
 
     side = min(batch, ROWS)
-    piece = Piece(functools.partial(program, rows=side), made(side), batch / side)
-    whole = functools.partial(program, rows=batch)
-    return measure(name, "states", batch, batch, whole, *made(batch), pieces=[piece])
+    piece = Piece(program, made(side), batch / side)
+    return measure(name, "states", batch, batch, program, *made(batch), pieces=[piece])
 
 
 def paths_needed(sub: SubRMDP, estimator: labels.Estimator, error: float, states: int) -> float:

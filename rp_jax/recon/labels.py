@@ -204,16 +204,26 @@ def _sampled(estimator: Callable[..., Labels], paths: int) -> Estimator:
 
 
 @functools.partial(jax.jit, static_argnames=("estimator", "batch", "mesh"))
-def _label(key, agent, hazard, sub, estimator, batch, mesh):
-    def several(keys, agent, hazard, sub):
+def label_rows(
+    key: Array,
+    agent: Any,
+    hazard: Any,
+    sub: SubRMDP,
+    estimator: Estimator,
+    batch: int = 16,
+    mesh: Mesh | None = None,
+) -> Labels:
+    """One compiled call of `label`: all rows (n, ...), `batch` of them side by side."""
+
+    def several(keys: Array, agent: Any, hazard: Any, sub: SubRMDP) -> Labels:
         one = lambda row: estimator(*row, sub)  # noqa: E731
         return jax.lax.map(one, (keys, agent, hazard), batch_size=batch)
 
     count = jax.tree.leaves(agent)[0].shape[0]
     keys = jax.random.split(key, count)
-    if mesh is not None:
-        several = devices.share_out(several, (0, 0, 0, None), mesh)
-    return several(keys, agent, hazard, sub)
+    if mesh is None:
+        return several(keys, agent, hazard, sub)
+    return devices.share_out(several, (0, 0, 0, None), mesh)(keys, agent, hazard, sub)
 
 
 def label(
@@ -258,7 +268,7 @@ def label(
         index = jnp.minimum(start + jnp.arange(rows), count - 1)
         take = lambda tree: jax.tree.map(lambda a: a[index], tree)  # noqa: E731
         chunk = jax.random.fold_in(key, start)
-        part = _label(chunk, take(agent), take(hazard), sub, estimator, batch, mesh)
+        part = label_rows(chunk, take(agent), take(hazard), sub, estimator, batch, mesh)
         part = devices.gather(part, mesh)
         for whole, new in zip(jax.tree.leaves(found), jax.tree.leaves(part), strict=True):
             whole[start : start + rows] = new[: count - start]

@@ -8,7 +8,7 @@ import os
 import killed
 import pytest
 
-KILLS = int(os.environ.get("RP_KILLS", "12"))
+KILLS = int(os.environ.get("RP_KILLS", "4"))
 
 
 @pytest.mark.slow
