@@ -216,7 +216,7 @@ def label_rows(
     """One compiled call of `label`: all rows (n, ...), `batch` of them side by side."""
 
     def several(keys: Array, agent: Any, hazard: Any, sub: SubRMDP) -> Labels:
-        one = lambda row: estimator(*row, sub)  # noqa: E731
+        one = lambda row: estimator(row[0], row[1], row[2], sub)  # noqa: E731
         return jax.lax.map(one, (keys, agent, hazard), batch_size=batch)
 
     count = jax.tree.leaves(agent)[0].shape[0]
