@@ -66,7 +66,7 @@ def preferential(
     error = jnp.mean(jnp.abs(model(features) - threat), axis=-1)
     rows = jax.random.choice(pick_key, len(features), (half,), p=error / jnp.sum(error))
     fresh = uniform(shift_key, sub, half)
-    # A step of a twentieth towards a uniform draw stays inside the window.
+    # A step of a twentieth towards a uniform draw stays in reach, or nearly so.
     near = features[rows] + 0.05 * (fresh - features[rows])
     # Features that no state has (a heading that is not of unit length) are brought back.
     near = jax.vmap(lambda f: sub.source.features(*sub.source.state_of(f)))(near)

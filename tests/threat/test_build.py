@@ -28,7 +28,7 @@ REPORT = {
 }
 STAGES = {
     "uniform": ["labels", "fit", "report"],
-    "preferential": ["labels", "fit", "labels", "fit", "calibration", "report"],
+    "preferential": ["labels", "fit", "more labels", "fit", "calibration", "report"],
 }
 SHORT = {circuit: {"horizon": 3}, jam: {"obstacle_horizon": 3}}  # rollouts, to compile soon
 draw = jax.jit(sampling.uniform, static_argnums=2)

@@ -53,12 +53,13 @@ def test_shares_of_nothing_are_zero():
     assert (unsafe["safe"], unsafe["safe_called_unsafe"], unsafe["unsafe_called_safe"]) == (0, 0, 1)
 
 
-def test_predictions_are_zero_outside_the_window_as_in_the_sum():
+def test_predictions_are_zero_out_of_reach_as_in_the_sum():
     network = ThreatNetwork((4,), 15)
     params = network.init(jax.random.key(0), jnp.zeros(3))
     model = ThreatModel(SUB.source, params, jnp.ones(3), jnp.zeros(()), network)
-    right, up = (float(a) for a in SUB.source.window.upper)
-    features = jnp.asarray([[0.0, 0.0, 0.1], [right + 0.1, 0, 0], [0, up + 0.1, 0], [right, up, 0]])
+    right, up = (float(a) for a in SUB.source.window_at(jnp.asarray(0.0)).upper)
+    rim = [right - 1e-6, up - 1e-6, 0]
+    features = jnp.asarray([[0.0, 0.0, 0.1], [right + 0.1, 0, 0], [0, up + 0.1, 0], rim])
     threat = predict(model, features)
     inside = jnp.asarray([0, 3])
     np.testing.assert_allclose(threat[inside], model(features)[inside], rtol=1e-6)
@@ -80,12 +81,13 @@ def crowd(seed, count, points):
     return agents, Hazards(jnp.asarray(walls, jnp.float32), present)
 
 
-def test_labelled_sums_add_the_labels_of_hazards_inside_the_window(exact):
+def test_labelled_sums_add_the_labels_of_hazards_in_reach(exact):
     agents, hazards = crowd(0, 6, 20)
     found = labelled_sum(jax.random.key(0), agents, hazards, SUB, exact_threat)
     features = jax.vmap(jax.vmap(SUB.source.features, (None, 0)))(agents, hazards.state)
     each = np.asarray(exact(features.reshape(-1, 3), SUB).threat, float).reshape(6, 20, 15)
-    counted = np.asarray(SUB.source.window.contains(features[..., :2]) & hazards.present)
+    reached = jax.vmap(jax.vmap(SUB.source.in_reach, (None, 0)))(agents, hazards.state)
+    counted = np.asarray(reached & hazards.present)
     assert 0 < counted.sum() < hazards.present.sum()  # some are outside
     assert found.shape == (6, 15)
     np.testing.assert_allclose(found, (each * counted[..., None]).sum(axis=1), atol=1e-4)

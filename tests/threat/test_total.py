@@ -71,12 +71,12 @@ def terms(models, agents, hazards):
         features = jax.jit(jax.vmap(jax.vmap(model.source.features, (None, 0))))
         features = np.asarray(features(agents, group.state))
         present = np.asarray(group.present)
-        low, high = map(np.asarray, (model.source.window.lower, model.source.window.upper))
+        reached = jax.jit(jax.vmap(jax.vmap(model.source.in_reach, (None, 0))))
+        reached = np.asarray(reached(agents, group.state))
         rows = []
         for i in range(count):
             for n in range(present.shape[1]):
-                place = features[i, n, :2]
-                if present[i, n] and (place >= low).all() and (place <= high).all():
+                if present[i, n] and reached[i, n]:
                     rows.append((i, features[i, n]))
         for start in range(0, len(rows), CHUNK):
             part = rows[start : start + CHUNK]
@@ -97,7 +97,7 @@ def test_the_states_are_a_fair_trial():
 
 
 @pytest.mark.parametrize("batch", [1, 7, FEW, MOST])
-def test_it_is_the_sum_over_the_hazards_inside_their_windows(batch):
+def test_it_is_the_sum_over_the_hazards_in_reach(batch):
     rows = np.random.default_rng(batch).choice(MOST, batch, replace=False)
     found = total(MODELS, some(AGENTS, rows), some(HAZARDS, rows))
     expected = np.stack([many_terms()[i].astype(float).sum(axis=0) for i in rows])
@@ -156,9 +156,9 @@ def test_where_absent_hazards_stand_makes_no_difference(nowhere):
     )
 
 
-def test_hazards_outside_the_window_count_nothing():
+def test_hazards_out_of_reach_count_nothing():
     model = {"wall": MODELS["wall"]}
-    window = SUBS["wall"].source.window
+    window = SUBS["wall"].source.window_at(jnp.zeros(()))
     agent = Vehicle(jnp.zeros((1, 2)), jnp.asarray([[1.0, 0.0]]), jnp.zeros(1))
 
     def at(x, y):
@@ -166,9 +166,10 @@ def test_hazards_outside_the_window_count_nothing():
         return total(model, agent, {"wall": Hazards(place, jnp.ones((1, 1), bool))})
 
     (left, down), (right, up) = np.asarray(window.lower), np.asarray(window.upper)
-    for x, y in ((right, 0.0), (left, 0.0), (0.0, up), (0.0, down), (right, up)):
-        assert (at(x, y) > 0).all()  # the rim belongs to it
-    for x, y in ((right + 1e-6, 0), (left - 1e-6, 0), (0, up + 1e-6), (0, down - 1e-6)):
+    rim = ((right, 0.0), (left, 0.0), (0.0, up), (0.0, down), (right, up))
+    for x, y in np.asarray(rim) * (1 - 1e-6):
+        assert (at(x, y) > 0).all()
+    for x, y in np.asarray(rim) * (1 + 1e-5):
         np.testing.assert_array_equal(at(x, y), np.zeros((1, 15)))
 
 
