@@ -176,7 +176,10 @@ def run(config: Config, loaded: runs.Run, folder: Path) -> dict[str, Any]:
     subject = Subject(pmdp, values, rare.compiled(values))
     key, search, check = jax.random.split(pipeline.key_of(config.seed, pipeline.RARE), 3)
     row, starts = estimates(key, subject, config)
-    row = {"env": loaded.task.name, "variant": variant, "sha256": loaded.sha256, **row}
+    subject_of = {"env": loaded.task.name, "variant": variant, "sha256": loaded.sha256}
+    row = {**subject_of, **row, "seed": config.seed}
+    storage.write_json(folder / "rare.json", row)  # the search may take long
+    show(row)
     if config.generations > 0:
         worst = worst_starts(search, subject, starts, config)
         crashes = crashes_from(check, subject, worst, config.checks)
@@ -188,10 +191,9 @@ def run(config: Config, loaded: runs.Run, folder: Path) -> dict[str, Any]:
             }
             for k in crashes
         ]
-        about = {"env": loaded.task.name, "variant": variant, "sha256": loaded.sha256}
-        storage.save(folder / "worst_starts", "start states", worst, about)
-    storage.write_json(folder / "rare.json", {**row, "seed": config.seed})
-    show(row)
+        storage.save(folder / "worst_starts", "start states", worst, subject_of)
+        storage.write_json(folder / "rare.json", row)
+        show_worst(row["worst_starts"])
     return row
 
 
@@ -213,14 +215,16 @@ def show(row: dict[str, Any]) -> None:
         },
     ]
     console.table(f"crash rate of {row['env']} {row['variant']}", lines, list(lines[0]))
-    if row.get("worst_starts"):
-        k = sum(r["crashes"] for r in row["worst_starts"])
-        n = sum(r["episodes"] for r in row["worst_starts"])
-        low, high = statistics.clopper_pearson(k, n)
-        console.say(
-            f"from the {len(row['worst_starts'])} worst starts found: {k} crashes of {n:,}, "
-            f"{100 * k / n:.2f} [{100 * low:.2f}, {100 * high:.2f}] %"
-        )
+
+
+def show_worst(rows: list[dict[str, Any]]) -> None:
+    """The starts that were found, in a line."""
+    k, n = sum(r["crashes"] for r in rows), sum(r["episodes"] for r in rows)
+    low, high = statistics.clopper_pearson(k, n)
+    console.say(
+        f"from the {len(rows)} worst starts found: {k} crashes of {n:,}, "
+        f"{100 * k / n:.2f} [{100 * low:.2f}, {100 * high:.2f}] %"
+    )
 
 
 def main() -> None:
