@@ -13,6 +13,7 @@ from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
 from rp_jax.envs.base import Hazards
 from rp_jax.recon import labels
 from rp_jax.threat.model import ThreatModel
+from rp_jax.threat.total import counted
 
 
 def compare(predicted: np.ndarray, true: np.ndarray, x: float) -> dict[str, float]:
@@ -70,7 +71,7 @@ def labelled_sum(
         estimator: labels a single (agent, hazard).
         checkpoints: of the labels.
     """
-    reached = np.asarray(_reached(agents, hazards, sub))
+    reached = np.asarray(jax.jit(counted)(sub.source, agents, hazards))
     row, column = np.nonzero(reached)
     total = np.zeros((reached.shape[0], sub.agent.num_threats))
     if len(row):
@@ -79,9 +80,3 @@ def labelled_sum(
         found = labels.label(key, agent, hazard, sub, estimator, checkpoints=checkpoints)
         np.add.at(total, row, np.asarray(found.threat, float))
     return total
-
-
-@jax.jit
-def _reached(agents: Any, hazards: Hazards, sub: Any) -> Array:
-    reached = jax.vmap(jax.vmap(sub.source.in_reach, (None, 0)))(agents, hazards.state)
-    return reached & hazards.present

@@ -45,6 +45,12 @@ def total_threat(
     return total * (1 + (terms + 1) * float(jnp.finfo(total.dtype).eps))
 
 
+def counted(source: Any, agents: Any, hazards: Hazards) -> Array:
+    """(B, n) bool, the hazards of one kind that are present and in reach of agents (B, ...)."""
+    reached = jax.vmap(jax.vmap(source.in_reach, (None, 0)))(agents, hazards.state)
+    return reached & hazards.present
+
+
 def _summed(model: ThreatModel, agents: Any, hazards: Hazards) -> Array:
     """(B, A) of one kind. Only hazards in reach are shown to the network.
 
@@ -53,8 +59,7 @@ def _summed(model: ThreatModel, agents: Any, hazards: Hazards) -> Array:
     """
     over_hazards = jax.vmap(model.source.features, (None, 0))
     features = jax.vmap(over_hazards)(agents, hazards.state)  # (B, n, F)
-    reached = jax.vmap(jax.vmap(model.source.in_reach, (None, 0)))(agents, hazards.state)
-    inside = reached & hazards.present
+    inside = counted(model.source, agents, hazards)
     batch, n = inside.shape
     if n == 0:
         return jnp.zeros((batch, model.network.num_actions), features.dtype)
