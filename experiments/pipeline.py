@@ -53,6 +53,7 @@ class Config:
     planning: LoopConfig = field(default_factory=LoopConfig)  # the learner
     fidelity: str = "released"  # "released" as the published numbers, "paper" as the text
     baseline: str = "paper"  # "paper": at random; "plans": braking and evading, walls jointly
+    lookahead: int = 0  # outcomes of each action looked at where none is admissible
 
     def validate(self) -> None:
         """Raises ValueError, naming the field, if a value is out of range."""
@@ -66,6 +67,7 @@ class Config:
         one_of("devices", self.devices, devices.DEVICES)
         one_of("fidelity", self.fidelity, ("released", "paper"))
         one_of("baseline", self.baseline, BASELINES)
+        number("lookahead", self.lookahead, least=0, most=10_000, integer=True)
         self.planning.validate("planning")
 
 
@@ -203,6 +205,7 @@ def make_pmdp(task: Task, config: Config, models: Mapping | None, params: Any) -
         toll=jnp.asarray(config.learning_toll, jnp.float32),
         env=task.env,
         pool=POOLS[config.planning.network],
+        lookahead=config.lookahead,
     )
 
 

@@ -73,8 +73,8 @@ class Plans(struct.PyTreeNode):
         """`in_axes` of a vmap over the plans."""
         return self.replace(rotation=0, target=0, steps=0, strongest=None)
 
-    def control(self, k: int, speed: Array) -> Control:
-        """The command of one plan at its step k; a row of the table, unbatched."""
+    def control(self, k: Array | int, speed: Array) -> Control:
+        """The command of one plan at its step k, (); a row of the table, unbatched."""
         wanted = jnp.where(k < self.steps, self.target, 0.0) - speed
         return Control(jnp.clip(wanted, -self.strongest, self.strongest), self.rotation)
 

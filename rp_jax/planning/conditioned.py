@@ -123,6 +123,9 @@ class ConditionedPMDP(PMDP):
         ratio = super().threat(states, alive) / states.x[:, None]
         return ratio * (1 + float(jnp.finfo(ratio.dtype).eps))
 
+    def _threshold(self, states: State) -> Array:
+        return states.x
+
 
 def condition(pmdp: PMDP, low: float, high: float) -> ConditionedPMDP:
     """The P-MDPs of all thresholds from `low` to `high` in one."""
@@ -134,4 +137,5 @@ def condition(pmdp: PMDP, low: float, high: float) -> ConditionedPMDP:
         toll=pmdp.toll,
         env=Conditioned(pmdp.env),
         pool=pmdp.pool,
+        lookahead=pmdp.lookahead,
     )

@@ -82,12 +82,19 @@ def certificate(cmdp: FiniteCMDP, upper: Array, x: Array | float) -> Certificate
     return Certificate(least, excess, least + spent.state)
 
 
-def _excess(cmdp: FiniteCMDP, upper: Array) -> tuple[Array, Array]:
-    """(H, S) m and (H, S, A) e."""
+def backup(cmdp: FiniteCMDP, upper: Array) -> Array:
+    """(H, S, A) d + beta E[m_{t+1}], one step of value iteration on U's least actions.
+
+    If U's excess is e, that of any mixture of U and the lesser of both is at most e.
+    """
     least = upper.min(axis=-1)
     ahead = least if cmdp.horizon is None else jnp.append(least[1:], 0 * least[:1], axis=0)
-    needed = cmdp.danger[None] + cmdp.beta * jnp.einsum("saz,hz->hsa", cmdp.transition, ahead)
-    return least, jnp.maximum(needed - upper, 0.0)
+    return cmdp.danger[None] + cmdp.beta * jnp.einsum("saz,hz->hsa", cmdp.transition, ahead)
+
+
+def _excess(cmdp: FiniteCMDP, upper: Array) -> tuple[Array, Array]:
+    """(H, S) m and (H, S, A) e."""
+    return upper.min(axis=-1), jnp.maximum(backup(cmdp, upper) - upper, 0.0)
 
 
 def certified(cmdp: FiniteCMDP, upper: Array, c: Array | float) -> Array:

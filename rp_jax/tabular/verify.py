@@ -250,12 +250,17 @@ def corollary_3(case: Instance) -> Array:
 
 
 def certificate(case: Instance) -> Array:
-    """Its bound holds at every state, for U above or below the threat, and so does its x."""
+    """Its bound holds at every state, for U above or below the threat, and so does its x.
+
+    A Bellman backup where nothing is secure adds no excess.
+    """
     cmdp, x = case.cmdp, case.x
     found = threat.threat(cmdp, case.eta).action
     broken = []
     for upper in (found, found + 0.3 * case.noise, found * case.noise, case.noise):
         proved = thresholds.certificate(cmdp, upper, x)
+        closer = looked_ahead(cmdp, upper, x)
+        broken.append(jnp.max(thresholds.certificate(cmdp, closer, x).excess - proved.excess))
         reached = secure.worst(cmdp, secure.secure(upper, x).admissible)
         c = _bound(case, cmdp.start @ proved.least[0]) + _steps(cmdp) * proved.excess.max()
         fixed = thresholds.certified(cmdp, upper, c)
@@ -263,6 +268,13 @@ def certificate(case: Instance) -> Array:
         over = jnp.where(fixed >= 0, _danger(case, inside) - c, 0.0)
         broken += [jnp.max(reached.state - proved.state), over]
     return jnp.max(jnp.stack(broken))
+
+
+def looked_ahead(cmdp: FiniteCMDP, upper: Array, x: Array | float) -> Array:
+    """(H, S, A) U, and where no action of it is at most x, the lesser of it and its backup."""
+    secure_at = secure.secure(upper, x).secure[..., None]
+    lesser = jnp.minimum(upper, thresholds.backup(cmdp, upper))
+    return jnp.where(secure_at, upper, lesser)
 
 
 def advantage(case: Instance) -> Array:
@@ -339,7 +351,7 @@ def theorem_3(model: factored.Factored, etas: Array, x: Array) -> Array:
     """T^eta <= sum_n T^{eta,n}; and Algorithm 2's policies, inside the sums' sets, keep c.
 
     The sum is an upper function of the certificate with no excess, and so is the least sum of
-    several plans. A share, as `violations`.
+    several plans, also where it is looked one step ahead. A share, as `violations`.
 
     Args:
         model: of agent and hazards.
@@ -352,7 +364,8 @@ def theorem_3(model: factored.Factored, etas: Array, x: Array) -> Array:
         whole = threat.threat(cmdp, factored.lifted(model, eta)).action
         totals.append(factored.summed(model, factored.sub_threats(model, eta)))
         broken.append(jnp.max(whole - totals[-1]))
-    for upper in (totals[0], jnp.minimum(*totals)):
+    least = jnp.minimum(*totals)
+    for upper in (totals[0], least, looked_ahead(cmdp, least, x)):
         excess = thresholds.certificate(cmdp, upper, x).excess
         c = cmdp.start @ upper.min(axis=-1)[0] + x * _steps(cmdp)
         allowed = secure.secure(upper, thresholds.certified(cmdp, upper, c)).admissible

@@ -130,16 +130,16 @@ class Calibration(NamedTuple):
 def calibrated(
     model: ThreatModel, data: Dataset, x: float, rate: float, confidence: float
 ) -> tuple[ThreatModel, Calibration]:
-    """Shifts the logits up until few states have an unsafe action (label above x) called safe.
+    """Shifts small logits up until few states have an unsafe action (label above x) called safe.
 
     The least shift for which the exact upper bound of that share is at most `rate`: an order
     statistic of the shift each state needs, as in split-conformal prediction. The bound holds for
     independent states that the model has not been fitted to, whatever the model; never downwards.
     Where there are too few unsafe states for the rate, none is let through, and `rate` is what
-    that shows.
+    that shows. Logits above x are unsafe as they are, and move less the larger they are.
 
     Args:
-        model: as fitted.
+        model: as fitted, not shifted yet.
         data: labelled states, independent of one another and of the fit.
         x: threshold, inside (0, 1): elsewhere no shift could change a decision.
         rate: most states with an unsafe action called safe.
@@ -150,14 +150,15 @@ def calibrated(
     n = int(counted.sum())
     if n == 0 or not 0 < x < 1:
         return model, Calibration(1.0, confidence, len(unsafe), n, 0)
-    short = np.where(unsafe, np.log(x / (1 - x)) - np.asarray(model.logits(data.features)), -np.inf)
+    knee = np.log(x / (1 - x))
+    short = np.where(unsafe, knee - np.asarray(model.logits(data.features)), -np.inf)
     needed = np.sort(short.max(axis=1)[counted])[::-1]
     allowed = max(0, statistics.events_allowed(n, rate, confidence))
     shift = max(0.0, float(needed[allowed]) + 1e-4)
     missed = int((needed > shift).sum())
     bound = statistics.upper_bound(allowed, n, confidence)
     facts = Calibration(bound, confidence, len(unsafe), n, missed)
-    return model.replace(shift=model.shift + shift), facts
+    return model.replace(shift=jnp.asarray(shift), knee=jnp.asarray(knee, model.knee.dtype)), facts
 
 
 def near_threshold(key: Array, sub: SubRMDP, model: ThreatModel, x: float, most: int) -> Array:

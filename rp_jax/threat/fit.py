@@ -93,9 +93,7 @@ def init(
     begin, onward = jax.random.split(key)
     params = network.init(begin, data.features[:1])
     scale = 1.0 / (jnp.std(data.features, axis=0) + 1e-6)
-    model = ThreatModel(
-        source=sub.source, params=params, scale=scale, shift=jnp.zeros(()), network=network
-    )
+    model = ThreatModel(sub.source, params, scale, jnp.zeros(()), network)
     return model, FitState(params, optimiser(config).init(params), onward)
 
 

@@ -34,13 +34,24 @@ class ThreatModel(struct.PyTreeNode):
     source: Any  # a HazardSource: features and window
     params: Any  # weights of `network`
     scale: Array  # (F,) features are multiplied by this before the network
-    shift: Array  # () added to every logit; above 0 to err on the safe side
+    shift: Array  # () added to logits up to `knee`; above 0 to err on the safe side
     network: ThreatNetwork = struct.field(pytree_node=False)
+    knee: Array = struct.field(default_factory=lambda: jnp.asarray(jnp.inf))  # () logit; far
+    # above it, threats are as fitted
 
     def logits(self, features: Array) -> Array:
         """(..., F) -> (..., A)."""
         scale = jnp.broadcast_to(self.scale, features.shape)
-        return jnp.asarray(self.network.apply(self.params, features * scale)) + self.shift
+        return self.shifted(jnp.asarray(self.network.apply(self.params, features * scale)))
+
+    def shifted(self, fitted: Array) -> Array:
+        """Logits of any shape, as fitted, moved up: by `shift` up to `knee`, then ever less.
+
+        The order of threats stays; from `knee` + 2 `shift` on they are as fitted, since the
+        fallback compares large ones.
+        """
+        fading = jnp.maximum(fitted, 0.5 * (fitted + self.knee) + self.shift)
+        return jnp.where(fitted <= self.knee, fitted + self.shift, fading)
 
     def __call__(self, features: Array) -> Array:
         """(..., F) -> (..., A) threats in [0, 1]."""

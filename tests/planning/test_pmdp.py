@@ -5,7 +5,7 @@ import probe
 from quick import compile_soon  # noqa: F401
 
 from rp_jax.envs import circuit, jam
-from rp_jax.planning.pmdp import PMDP, encode
+from rp_jax.planning.pmdp import OUTCOMES, PMDP, encode
 from rp_jax.threat.model import ThreatModel, ThreatNetwork
 from rp_jax.threat.static import bounded, plan_clearance, static_threat
 from rp_jax.threat.total import total_threat
@@ -116,16 +116,21 @@ def under_plans(env, params, models):
     return PMDP(params, models, x=jnp.asarray(0.01), penalty=zero, toll=zero, env=env)
 
 
-def test_under_plans_an_action_is_as_good_as_its_best_plan():
+def beside_an_obstacle():
+    """Jam under plans with an untrained model, and five states."""
     params = jam.make_params(3, baseline="plans")
     sub = jam.sub_rmdps(params)["obstacle"]
     network = ThreatNetwork((8,), sub.agent.num_threats, "silu")
     weights = jax.tree.map(lambda a: 3 * a, network.init(jax.random.key(0), jnp.zeros(6)))
     model = ThreatModel(sub.source, weights, jnp.full(6, 3.0), jnp.asarray(-1.0), network)
-    pmdp = under_plans(jam, params, {"obstacle": model})
     start = jax.vmap(jam.reset, (0, None))(jax.random.split(jax.random.key(1), 5), params)
     near = start.agent.replace(position=start.obstacles.position[:, 0] + 0.3)
-    start = start.replace(agent=near)
+    return params, model, start.replace(agent=near)
+
+
+def test_under_plans_an_action_is_as_good_as_its_best_plan():
+    params, model, start = beside_an_obstacle()
+    pmdp = under_plans(jam, params, {"obstacle": model})
     found = jax.jit(pmdp.threat)(start)
     assert found.shape == (5, 15)
 
@@ -154,3 +159,60 @@ def test_under_plans_walls_need_no_model():
     assert ((percept.threat == 0) | (percept.threat >= 2)).all()
     assert percept.admissible.any(axis=-1).all()
     assert not percept.admissible.all()
+
+
+_step = jax.jit(lambda key, state, action, pmdp: pmdp.env.step(key, state, action, pmdp.params))
+_threat = jax.jit(lambda pmdp, states: pmdp.threat(states))
+
+
+def slow_backup(pmdp, state, samples):
+    """(A,) what danger each action leads to, outcome by outcome."""
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(OUTCOMES), state.time), samples)
+    found = np.zeros((pmdp.env.num_actions(pmdp.params), samples))
+    for action, sample in np.ndindex(found.shape):
+        reached, outcome = _step(keys[sample], state, jnp.asarray(action), pmdp)
+        found[action, sample] = outcome.danger
+        if not outcome.terminated:
+            one = jax.tree.map(lambda a: a[None], reached)
+            found[action, sample] += _threat(pmdp, one).min()
+    return found.mean(axis=1)
+
+
+def check_lookahead(pmdp, states, samples):
+    """Where no action is admissible, the lesser of threat and backup; elsewhere the threat."""
+    threat = np.asarray(_threat(pmdp, states))
+    ahead = np.asarray(_threat(pmdp.replace(lookahead=samples), states))
+    insecure = threat.min(axis=1) > np.asarray(pmdp.x)
+    assert insecure.any()
+    assert not insecure.all()
+    np.testing.assert_allclose(ahead[~insecure], threat[~insecure], rtol=1e-6)
+    for i in np.flatnonzero(insecure):
+        state = jax.tree.map(lambda a, i=i: a[i], states)
+        lesser = np.minimum(threat[i], slow_backup(pmdp, state, samples))
+        np.testing.assert_allclose(ahead[i], lesser, rtol=2e-5, atol=1e-7)
+    return threat[insecure], ahead[insecure]
+
+
+def test_one_step_ahead_where_nothing_is_admissible():
+    params, model, start = beside_an_obstacle()
+    start = start.replace(time=jnp.arange(5, dtype=jnp.int32))
+    pmdp = under_plans(jam, params, {"obstacle": model})
+    least = jnp.sort(jax.jit(pmdp.threat)(start).min(axis=1))
+    threat, ahead = check_lookahead(pmdp.replace(x=(least[1] + least[2]) / 2), start, 3)
+    assert (ahead < threat).any()
+
+
+def test_one_step_ahead_under_the_paper_s_baseline():
+    """Beside the pit nothing changes; who is in it is in danger of no more."""
+    pmdp = probe.make_pmdp(probe, PARAMS)
+    threat, ahead = check_lookahead(pmdp, states([1, 4, 5, 6]), 2)
+    assert (ahead <= threat).all()
+
+
+def test_looking_ahead_asks_nothing_of_the_dead():
+    params, model, start = beside_an_obstacle()
+    pmdp = under_plans(jam, params, {"obstacle": model}).replace(x=jnp.zeros(()), lookahead=2)
+    alive = jnp.asarray([True, False, True, True, False])
+    whole, some = (np.asarray(jax.jit(pmdp.threat)(start, a)) for a in (None, alive))
+    np.testing.assert_array_equal(some[[1, 4]], 0)
+    np.testing.assert_allclose(some[[0, 2, 3]], whole[[0, 2, 3]], rtol=1e-5)

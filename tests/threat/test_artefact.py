@@ -29,7 +29,8 @@ def models_of(env):
         network = ThreatNetwork((8, widths[kind]), 15, "silu" if kind == "wall" else "relu")
         weights = network.init(jax.random.key(widths[kind]), jnp.zeros(widths[kind]))
         scale = jnp.arange(1.0, widths[kind] + 1)
-        models[kind] = ThreatModel(sub.source, weights, scale, jnp.asarray(0.25), network)
+        shift, knee = jnp.asarray(0.25), jnp.asarray(-2.0)
+        models[kind] = ThreatModel(sub.source, weights, scale, shift, network, knee)
     return models
 
 

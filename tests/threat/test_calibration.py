@@ -22,9 +22,14 @@ def toy(n=1000, seed=0):
     return Dataset(features, jnp.clip(near[:, None] * jnp.linspace(0.1, 1.5, 15)[None], 0, 1))
 
 
-def fresh_model():
+def fresh_model(bias=0.0):
     model, _ = fit.init(jax.random.key(0), SUB, toy(), fit.FitConfig(hidden=(8,)))
-    return model
+    last = model.params["params"]["Dense_1"]
+    return model.replace(
+        params={
+            "params": {**model.params["params"], "Dense_1": {**last, "bias": last["bias"] + bias}}
+        }
+    )
 
 
 def missed(model, data, x):
@@ -36,18 +41,19 @@ def missed(model, data, x):
 @pytest.mark.parametrize("x", [0.001, 0.01, 0.3])
 @pytest.mark.parametrize("rate", [0.2, 0.05])
 def test_the_shift_is_the_least_that_the_bound_allows(rate, x):
-    model = fresh_model().replace(shift=jnp.asarray(-8.0))
+    model = fresh_model(-8.0)
     careful, facts = build.calibrated(model, toy(), x, rate, 0.9)
     k, n = missed(careful, toy(), x)
     assert (k, n) == (facts.missed, facts.unsafe_states)
     assert upper_bound(k, n, 0.9) <= facts.rate <= rate
     less = careful.replace(shift=careful.shift - 0.1)
     assert upper_bound(missed(less, toy(), x)[0], n, 0.9) > rate
-    assert careful.shift > model.shift
+    assert careful.shift > 0
+    assert careful.knee == pytest.approx(np.log(x / (1 - x)))
 
 
 def test_too_few_states_show_what_they_can():
-    model = fresh_model().replace(shift=jnp.asarray(-8.0))
+    model = fresh_model(-8.0)
     careful, facts = build.calibrated(model, toy(30), 0.01, 1e-4, 0.95)
     assert facts.missed == 0
     assert missed(careful, toy(30), 0.01)[0] == 0
@@ -56,8 +62,16 @@ def test_too_few_states_show_what_they_can():
 
 
 def test_it_never_shifts_downwards():
-    model = fresh_model().replace(shift=jnp.asarray(9.0))
-    assert build.calibrated(model, toy(), 0.01, 0.5, 0.9)[0].shift == 9.0
+    assert build.calibrated(fresh_model(9.0), toy(), 0.01, 0.5, 0.9)[0].shift == 0
+
+
+def test_threats_far_above_x_stay_as_fitted():
+    model = fresh_model(-8.0)
+    careful, _ = build.calibrated(model, toy(), 0.01, 0.05, 0.9)
+    far = careful.knee + 2 * careful.shift
+    at = lambda logit: careful.shifted(jnp.asarray(logit))  # noqa: E731
+    assert at(far) == far
+    assert at(careful.knee) == pytest.approx(float(careful.knee + careful.shift))
 
 
 def test_it_leaves_a_model_alone_where_nothing_can_be_learned():
@@ -71,7 +85,7 @@ def test_it_leaves_a_model_alone_where_nothing_can_be_learned():
 def test_the_statement_holds_as_often_as_it_says():
     """Over draws of the calibrating states, the true share exceeds the rate in at most a tenth."""
     x, rate, confidence = 0.01, 0.1, 0.9
-    model = fresh_model().replace(shift=jnp.asarray(-8.0))
+    model = fresh_model(-8.0)
     far = toy(20_000, seed=1)
     held = 0
     for seed in range(200):

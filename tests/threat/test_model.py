@@ -10,11 +10,11 @@ from rp_jax.threat.model import ACTIVATIONS, ThreatModel, ThreatNetwork
 call = jax.jit(lambda model, features: model(features))
 
 
-def random_model(hidden=(8, 4), activation="silu", shift=0.0):
+def random_model(hidden=(8, 4), activation="silu", shift=0.0, knee=jnp.inf):
     network = ThreatNetwork(hidden, 3, activation)
     params = jax.jit(network.init)(jax.random.key(0), jnp.zeros(3))
     scale = jnp.asarray([0.5, 2.0, 10.0])
-    return ThreatModel(None, params, scale, jnp.asarray(shift), network)
+    return ThreatModel(None, params, scale, jnp.asarray(shift), network, jnp.asarray(knee))
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
@@ -54,6 +54,20 @@ def test_a_shift_upwards_raises_every_threat():
     features = 0.1 * jax.random.normal(jax.random.key(2), (50, 3))
     plain, shifted = random_model()(features), random_model(shift=0.5)(features)
     assert (shifted > plain).all()
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.5, 3.0])
+def test_the_shift_fades_above_the_knee(shift):
+    knee = -2.0
+    fitted = jnp.linspace(-20, 20, 4001)
+    moved = random_model(shift=shift, knee=knee).shifted(fitted)
+    low, high = fitted <= knee, fitted >= knee + 2 * shift
+    np.testing.assert_allclose(moved[low], fitted[low] + shift, rtol=1e-6)
+    np.testing.assert_array_equal(moved[high], fitted[high])
+    assert (jnp.diff(moved) > 0).all()
+    between = ~low & ~high
+    assert (moved[between] > fitted[between]).all()
+    assert (moved[between] < fitted[between] + shift).all()
 
 
 def test_the_probe_s_weights_say_what_enumeration_says(exact):
