@@ -27,6 +27,7 @@ class Outcome(struct.PyTreeNode):
 
 
 BASELINES = ("paper", "plans")  # policies that threats are measured under
+FARTHEST = 30  # steps within which wall points are hit, at most: the look-up tables grow with it
 
 
 class Hazards(NamedTuple):

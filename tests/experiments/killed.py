@@ -35,7 +35,7 @@ WHOLE = [("beginning", "write"), *itertools.product(LOOPS[:4], ("write", "moment
 REUSED = [("planning", "write"), ("planning", "moment")] * 2  # with a threat function at hand
 REUSED += [("evaluation", "write"), ("evaluation", "moment"), ("end", "write")]
 ANYWHERE = [("", "write")] * 4
-COVER = [("whole", WHOLE), ("reused", REUSED), ("whole", ANYWHERE)]
+COVER = [("whole", WHOLE), ("reused", REUSED)] * 2 + [("whole", ANYWHERE)]
 
 
 def corridor():
@@ -93,9 +93,9 @@ def worker(argv, target, tell):
 
     def counted(operation):
         def call(*args, **kwargs):
-            counts.update((phase, ""))
-            if target and phase in (target.phase, phase if target.phase == "" else None):
-                if counts[target.phase] == target.operation:
+            for place in (phase, ""):
+                counts[place] += 1
+                if target == (place, counts[place]):
                     os.kill(os.getpid(), signal.SIGKILL)
             return operation(*args, **kwargs)
 
@@ -158,13 +158,19 @@ class Ended(NamedTuple):
         return self.told[-1][0] if self.told else "beginning"
 
 
-def wait(pid, lines, said, moment=None, meanwhile=lambda: None):
-    """Waits for a worker; with a `moment`, (phase, seconds), kills it that long after."""
+def wait(pid, lines, said, moment=None, beside=None):
+    """Waits for a worker; with a `moment`, (phase, seconds), kills it that long after.
+
+    `beside` is called while the worker stands still at the beginning of that phase.
+    """
     told = []
     for line in lines:
         told.append(json.loads(line))
         if moment and told[-1][0] == moment[0]:
-            meanwhile()
+            if beside:
+                os.kill(pid, signal.SIGSTOP)
+                beside()
+                os.kill(pid, signal.SIGCONT)
             time.sleep(moment[1])
             os.kill(pid, signal.SIGKILL)
             moment = None
@@ -250,9 +256,9 @@ def arguments_of(run, reference):
     return ["--out", run, *reference.arguments]
 
 
-def one_run(dice, reference, targets, run, hit, beside):
+def one_run(dice, reference, targets, run, hit):
     """A run that is killed at each of its targets, and then goes on to its end."""
-    said = run.with_suffix(".txt")
+    said, beside = run.with_suffix(".txt"), lambda: refused_beside(run, run.with_suffix(".beside"))
     for phase, kind in targets:
         at = chosen(dice, reference, run, phase, kind)
         if at is None:
@@ -261,9 +267,8 @@ def one_run(dice, reference, targets, run, hit, beside):
         if isinstance(at, Target):
             ended = wait(*begin(arguments, said, at), said)
         else:
-            check = (lambda: refused_beside(run, run.with_suffix(".beside"))) if beside else None
-            ended = wait(*begin(arguments, said), said, at, check or (lambda: None))
-            beside = False
+            ended = wait(*begin(arguments, said), said, at, beside)
+            beside = None  # once a run
         if ended.code != -signal.SIGKILL:
             assert ended.code == 0 or "it is finished" in ended.said, ended.said
             break
@@ -293,8 +298,8 @@ def lane(number, lanes, kills, seed, references, folder, log):
         if hits >= kills:
             return
         name, targets = COVER[(i + number) % len(COVER)]
-        beside = i == 0
-        one_run(dice, references[name], targets, folder / f"{number}-{i}", hit, beside)
+        run = folder / f"{number}-{i}"
+        one_run(dice, references[name], targets[: kills - hits], run, hit)
         os.write(log, b'{"finished": 1}\n')
 
 
