@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rp_jax.validate import leading, number, ranked
+from rp_jax.validate import leading, number, random_key, ranked
 
 WORD = 32  # actions to a word of a stored mask
 
@@ -126,6 +126,7 @@ def _preference(threat: Array, action: Array, table: Array | None) -> Array:
 
 def masked_sample(key: Array, admissible: Array) -> Array:
     """() int, uniform over the admissible actions."""
+    random_key("key", key)
     ranked(1, admissible=admissible)
     rank = jnp.cumsum(admissible)
     uniform = jax.random.uniform(key)

@@ -29,7 +29,6 @@ SPEEDS = tuple(round(0.02 * k, 2) for k in range(-2, 6))  # -.04 .. .1 room unit
 LIDAR_BINS = 360
 SCALE: tuple[float, ...] = (1.0, 1.0, 1.0, 10.0)  # of x, y, bend, speed, for learners
 FIDELITIES = ("released", "paper")
-SMALLEST = 0.02  # radius of a vehicle: two cells of the table of distances to walls
 
 
 class State(struct.PyTreeNode):
@@ -83,7 +82,7 @@ def make_params(
     one_of("baseline", baseline, base.BASELINES)
     positive("time_limit", time_limit, most=10**9, integer=True)
     positive("horizon", horizon, most=base.FARTHEST, integer=True)
-    number("radius", radius, least=SMALLEST, most=tracks.LARGEST)
+    number("radius", radius, least=base.SMALLEST, most=tracks.LARGEST)
     positive("beta", beta, most=1.0)
     if not isinstance(track, tracks.TrackPlan):
         track = tracks.PLANS[one_of("track", track, tracks.PLANS)]()

@@ -40,7 +40,6 @@ SCALE: tuple[float, ...] = (1.0, 1.0, 1.0, 10.0) * (
 )  # of x, y, heading, speed, for learners
 UNSEEN = (-1.5, -1.51)  # where the observation puts obstacles that do not exist
 FIDELITIES = ("released", "paper")
-SMALLEST = 0.02  # radius of a vehicle: two cells of the table of distances to walls
 EVADING = 3  # steps for which plans drive on or back off before they brake
 
 
@@ -125,7 +124,7 @@ def make_params(
     one_of("fidelity", fidelity, FIDELITIES)
     one_of("baseline", baseline, base.BASELINES)
     positive("time_limit", time_limit, most=10**9, integer=True)
-    number("radius", radius, least=SMALLEST, most=0.2)
+    number("radius", radius, least=base.SMALLEST, most=0.2)
     room = int((ROOM / (2 * radius)) ** 2)  # how many fit, side by side
     number("num_obstacles", num_obstacles, least=1, most=room, integer=True)
     positive("beta", beta, most=1.0)
