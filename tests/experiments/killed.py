@@ -311,8 +311,7 @@ def summary(log, facts, began):
     hits = Counter(line["hit"] for line in lines if "hit" in line)
     finished = sum(line.get("finished", 0) for line in lines)
     found = {**facts, "kills": sum(hits.values()), "runs_to_the_same_bits": finished}
-    spent = {"seconds": time.monotonic() - began, "cpu_seconds": sum(os.times()[:4])}
-    return {**found, "hits": dict(sorted(hits.items())), **spent}
+    return {**found, "hits": dict(sorted(hits.items())), "seconds": time.monotonic() - began}
 
 
 def campaign(kills, seed, lanes, folder, out=None):
@@ -353,7 +352,10 @@ def campaign(kills, seed, lanes, folder, out=None):
         time.sleep(1)
         if out:
             storage.write_json(out, summary(log, facts, began))
-    return summary(log, facts, began)
+    found = {**summary(log, facts, began), "cpu_seconds": sum(os.times()[:4])}
+    if out:
+        storage.write_json(out, found)
+    return found
 
 
 def main():
@@ -368,7 +370,6 @@ def main():
     os.environ.update(OPENBLAS_NUM_THREADS="1", COLUMNS="200")
     sys.path[:0] = [str(TESTS.parent), str(TESTS)]
     import jax
-
     import quick  # noqa: F401
 
     from experiments import cli  # noqa: F401
