@@ -19,7 +19,7 @@ from experiments import runs
 from rp_jax import storage
 from rp_jax.threat import artefact
 
-MANY = int(os.environ.get("RP_FUZZ", "1000"))
+MANY = int(os.environ.get("RP_FUZZ", "300"))
 HARD = MANY // 10  # of those that trace a program
 SIZES = ["", "1e12", "-1", "99999999999999999999", "nan", "null", "[]", "{}", '"', "\x00", "é"]
 
