@@ -11,6 +11,7 @@ from collections import Counter
 
 import killed
 import pytest
+from forked import LOOPS
 
 KILLS = int(os.environ.get("RP_KILLS", "25"))
 
@@ -28,5 +29,5 @@ def test_killed_runs_come_to_the_same_bits(tmp_path):
     assert found["runs_to_the_same_bits"] >= 2
     at_writes = Counter({name: n for name, n in found["hits"].items() if "at a write" in name})
     assert sum(at_writes.values()) < KILLS  # the others came at random moments
-    for stage in killed.LOOPS:
+    for stage in LOOPS:
         assert at_writes[f"{stage}, at a write"] >= 1
