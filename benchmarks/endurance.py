@@ -7,9 +7,10 @@ python -m benchmarks.endurance --steps 100000000
 import dataclasses
 import resource
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -23,6 +24,7 @@ from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import number, one_of
 
 CHUNK = 200  # iterations
+EVERY = 50  # chunks between two reports
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class Config:
     minutes: float = 2.0
     steps: int = 100_000_000  # of the environment, shielded, while learning
     env: str = "jam"  # or circuit
-    out: Path | None = None  # file for what was measured
+    out: Path | None = None  # file for what was measured, kept up to date on the way
 
 
 def memory() -> float:
@@ -63,19 +65,34 @@ def train(config: Config) -> Iterator[dict[str, float]]:
     chunk = jax.jit(counted, donate_argnums=0)
     init = jax.jit(lambda key, pmdp: loop.init(key, pmdp, learning))
     state, metrics = init(jax.random.key(0), pmdp)
-    began, steps, wrong = time.monotonic(), 0, 0
+    began, steps, wrong = time.monotonic(), int(metrics.steps), int(metrics.inadmissible)
     while steps < config.steps and time.monotonic() - began < 60 * config.minutes:
+        state, metrics = chunk(state, pmdp)
         steps += int(metrics.steps)
         wrong += int(metrics.inadmissible)
-        state, metrics = chunk(state, pmdp)
         loop.check(state.learner.params, jax.tree.map(np.asarray, metrics))
         yield {
             "minutes": (time.monotonic() - began) / 60,
-            "steps": steps + int(metrics.steps),
-            "inadmissible": wrong + int(metrics.inadmissible),
+            "steps": steps,
+            "inadmissible": wrong,
             "megabytes": memory(),
             "traces": traces,
         }
+
+
+def summary(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
+    """The last row, and how memory grew in the second half of the time.
+
+    `megabytes_per_hour` is the slope of a least-squares line, None over fewer than three rows.
+    """
+    half = [row for row in rows if row["minutes"] > rows[-1]["minutes"] / 2]
+    hours = np.asarray([row["minutes"] for row in half]) / 60
+    memory = np.asarray([row["megabytes"] for row in half])
+    slope = None
+    if len(half) > 2:
+        away = hours - hours.mean()
+        slope = float(away @ memory / (away @ away))
+    return {**rows[-1], "megabytes_per_hour": slope, "hours_of_second_half": float(np.ptp(hours))}
 
 
 def main() -> None:
@@ -84,18 +101,21 @@ def main() -> None:
     one_of("env", config.env, setups.tasks())
     number("minutes", config.minutes, above=0)
     number("steps", config.steps, least=1, integer=True)
-    rows = []
+    rows: list[dict[str, float]] = []
+
+    def report() -> dict[str, Any]:
+        found = summary(rows)
+        known = {name: value for name, value in found.items() if value is not None}
+        console.say("  ".join(f"{name} {value:,.6g}" for name, value in known.items()))
+        if config.out is not None:
+            storage.write_json(config.out, found)
+        return found
+
     for row in train(config):
         rows.append(row)
-        if len(rows) % 50 == 1:
-            console.say("  ".join(f"{name} {value:,.6g}" for name, value in row.items()))
-    half = [row for row in rows if row["minutes"] > rows[-1]["minutes"] / 2]
-    hours = (half[-1]["minutes"] - half[0]["minutes"]) / 60
-    growth = half[-1]["megabytes"] - half[0]["megabytes"]
-    found = {**rows[-1], "growth_in_second_half": growth, "hours_of_second_half": hours}
-    console.say("  ".join(f"{name} {value:,.6g}" for name, value in found.items()))
-    if config.out is not None:
-        storage.write_json(config.out, found)
+        if len(rows) % EVERY == 1:
+            report()
+    found = report()
     if found["inadmissible"] or found["traces"] > 1:
         raise SystemExit(1)
 

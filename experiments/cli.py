@@ -5,7 +5,7 @@ import dataclasses
 import importlib.util
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -99,17 +99,23 @@ def resumed(name: str, folder: Path, kind: type, argv: Sequence[str]) -> tuple[A
 
 @contextmanager
 def resumable(name: str, folder: Path, checkpoints: Checkpoints) -> Iterator[None]:
-    """Around a run: says how to go on if it is stopped, exits with 130 (Ctrl-C) or 1 (an error)."""
+    """Around a run: says how to go on if it is stopped, exits with 130 (Ctrl-C) or 1 (an error).
+
+    Exits with 2 if another process is at work on the run.
+    """
     again = f"to go on: python -m {name} --resume {folder}"
-    try:
-        yield
-    except KeyboardInterrupt as stop:
-        console.say(f"interrupted ({stop or 'between two steps'}); {again}", style="yellow")
-        raise SystemExit(130) from None
-    except (FloatingPointError, storage.StorageError) as error:
-        console.say(f"error: {error}; {again}", style="red")
-        raise SystemExit(1) from None
-    checkpoints.clear()
+    with ExitStack() as stack:
+        with bad_input():
+            stack.enter_context(storage.locked(folder, settings.LOCK))
+        try:
+            yield
+        except KeyboardInterrupt as stop:
+            console.say(f"interrupted ({stop or 'between two steps'}); {again}", style="yellow")
+            raise SystemExit(130) from None
+        except (FloatingPointError, storage.StorageError) as error:
+            console.say(f"error: {error}; {again}", style="red")
+            raise SystemExit(1) from None
+        checkpoints.clear()
 
 
 def _description(about: str, presets: Mapping[str, Any]) -> str:

@@ -17,6 +17,7 @@ from rp_jax import storage
 from rp_jax.checkpoints import Checkpoints
 
 CHECKPOINTS = "checkpoints"  # folder inside that of a run, until the run is finished
+LOCK = f"{CHECKPOINTS}/lock"  # held by the process that is at work on a run
 
 
 def machine() -> dict[str, Any]:

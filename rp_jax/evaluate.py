@@ -11,8 +11,8 @@ from jax import Array
 
 from rp_jax import shield, statistics
 from rp_jax.envs.base import select
-from rp_jax.planning.pmdp import PMDP, Percept
-from rp_jax.validate import finite
+from rp_jax.planning.pmdp import PMDP, Percept, faults
+from rp_jax.validate import finite, leading, none_bad, number, random_key
 
 # Chooses for a batch of states: (key, percept) -> (actions (B,) or (B, 2), (B,) bool: these are
 # not the actions that it would have preferred).
@@ -43,6 +43,7 @@ def shielded(values: Callable[[Percept], Array]) -> Policy:
 
     def choose(_: Array, percept: Percept) -> tuple[Array, Array]:
         scores = values(percept)
+        leading(admissible=percept.admissible, values=scores)
         action = jax.vmap(shield.masked_argmax)(scores, percept.admissible)
         return action, jnp.argmax(scores, axis=-1) != action
 
@@ -68,6 +69,9 @@ def run_episodes(
 
     Returns:
         Rows with leading axis (episodes,).
+
+    Raises:
+        ValueError: a count is not above 0, or the scores are not (B, A).
     """
     return play_episodes(key, pmdp, shielded(values), episodes, batch=batch)
 
@@ -76,6 +80,9 @@ def play_episodes(
     key: Array, pmdp: PMDP, policy: Policy, episodes: int, *, batch: int = 1000
 ) -> Episodes:
     """`run_episodes` of any policy, also of a random one or one with continuous actions."""
+    random_key("key", key)
+    number("episodes", episodes, least=1, integer=True)
+    number("batch", batch, least=1, integer=True)
     rounds = -(-episodes // batch)
 
     def one_round(key: Array) -> Episodes:
@@ -98,7 +105,7 @@ def play_episodes(
             step = jax.vmap(pmdp.env.step, (0, 0, 0, None))
             reached, outcome = step(step_keys, states, action, pmdp.params)
             hit = jax.vmap(pmdp.env.causes, (0, None))(reached, pmdp.params)
-            bad_observation, bad_threat = percept.faults()
+            bad_observation, bad_threat = faults(percept.encoded, percept.threat)
             new = Episodes(
                 score=rows.score + outcome.reward,
                 danger=rows.danger + outcome.danger,
@@ -122,10 +129,7 @@ def play_episodes(
 
 def check(rows: Episodes, name: str) -> None:
     """Raises FloatingPointError if an episode saw or earned what is not a finite number."""
-    for what in ("observations", "threats"):
-        count = int(np.sum(getattr(rows, f"bad_{what}")))
-        if count:
-            raise FloatingPointError(f"{name}: {what} of {count:,} steps are nan or infinite")
+    none_bad(name, rows)
     finite(f"{name}: returns", rows.score)
     finite(f"{name}: dangers", rows.danger)
 

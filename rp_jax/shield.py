@@ -5,11 +5,12 @@ Primitives are unbatched: threats and values are (A,), masks (A,) bool.
 
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+
+from rp_jax.validate import leading, number, random_key, ranked
 
 WORD = 32  # actions to a word of a stored mask
 
@@ -30,7 +31,8 @@ def shield(threat: Array, x: Array | float) -> Shield:
         threat: (A,) action threats T(s, .).
         x: threshold; infinity switches the shield off.
     """
-    chex.assert_rank([threat, x], [1, 0])
+    ranked(1, threat=threat)
+    ranked(0, x=x) if hasattr(x, "shape") else number("x", x, infinite=True)
     allowed = threat <= x
     secure = jnp.any(allowed)
     fallback = jnp.arange(threat.shape[0]) == greedy_eta(threat)
@@ -64,7 +66,8 @@ def greedy_eta(threat: Array) -> Array:
 
 def masked_argmax(values: Array, admissible: Array) -> Array:
     """() int, the admissible action of the greatest value (Algorithm 4, line 6)."""
-    chex.assert_rank([values, admissible], 1)
+    ranked(1, values=values, admissible=admissible)
+    leading(admissible=admissible, values=values)
     return jnp.argmax(jnp.where(admissible, values, -jnp.inf))
 
 
@@ -92,7 +95,7 @@ def correct(
     Raises:
         ValueError: the wish has a shape or type of none of these.
     """
-    mask, secure = shield(threat, jnp.asarray(x))
+    mask, secure = shield(threat, x)
     scores = _preference(threat, action, table)
     # Finite, so that masked_argmax tells the worst admissible one from those not admissible.
     scores = jnp.nan_to_num(scores, nan=jnp.finfo(scores.dtype).min)
@@ -102,8 +105,10 @@ def correct(
 
 def _preference(threat: Array, action: Array, table: Array | None) -> Array:
     """(A,) the higher, the more a wish allows for it."""
+    ranked(np.ndim(action), action=action)
     real = jnp.issubdtype(action.dtype, jnp.floating)
     if table is not None:
+        ranked(2, table=table)
         shape: tuple[int, ...] = (table.shape[1],)
         if real and action.shape == shape:
             return -jnp.sum(jnp.square(action[None] - table), axis=-1)
@@ -121,6 +126,8 @@ def _preference(threat: Array, action: Array, table: Array | None) -> Array:
 
 def masked_sample(key: Array, admissible: Array) -> Array:
     """() int, uniform over the admissible actions."""
+    random_key("key", key)
+    ranked(1, admissible=admissible)
     rank = jnp.cumsum(admissible)
     uniform = jax.random.uniform(key)
     chosen = jnp.minimum(jnp.floor(uniform * rank[-1]), rank[-1] - 1)
@@ -129,7 +136,7 @@ def masked_sample(key: Array, admissible: Array) -> Array:
 
 def to_bits(admissible: Array) -> Array:
     """(W,) uint32, the mask (A,) as words of 32 actions, for storage."""
-    chex.assert_rank(admissible, 1)
+    ranked(1, admissible=admissible)
     parts = jnp.split(admissible, list(range(WORD, len(admissible), WORD)))
     bits = [part.astype(jnp.uint32) << _places(len(part)) for part in parts]
     return jnp.stack([jnp.sum(word, dtype=jnp.uint32) for word in bits])
@@ -137,7 +144,8 @@ def to_bits(admissible: Array) -> Array:
 
 def from_bits(bits: Array, num_actions: int) -> Array:
     """(A,) bool, the inverse of `to_bits`."""
-    chex.assert_rank(bits, 1)
+    ranked(1, bits=bits)
+    number("num_actions", num_actions, least=1, most=WORD * len(bits), integer=True)
     each = (bits[:, None] >> _places(WORD)[None]) & 1
     return each.astype(bool).reshape(-1)[:num_actions]
 

@@ -1,13 +1,14 @@
 """Files that are whole or absent: atomic writes, and arrays with a manifest of checksums."""
 
 import contextlib
+import fcntl
 import hashlib
 import json
 import math
 import os
 import re
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +99,34 @@ def new_folder(path: Path) -> Path:
     if not os.access(path, os.W_OK):
         raise StorageError(f"out is {path}; it cannot be written")
     return path
+
+
+@contextlib.contextmanager
+def locked(folder: Path, name: str) -> Iterator[None]:
+    """Keeps other processes from entering a folder; ends with the process, however that ends.
+
+    Args:
+        folder: named in messages.
+        name: of the lock, a file in it.
+
+    Raises:
+        StorageError: another process is inside, or has left and removed the lock.
+    """
+    path = Path(folder) / name
+    try:
+        file = path.open("w")
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written ({error.strerror})") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise StorageError(f"{folder}: another process is at work in this folder") from None
+        except OSError:
+            pass  # a file system without locks
+        if not path.exists():
+            raise StorageError(f"{folder}: another process has just finished in this folder")
+        yield
 
 
 def leaves(tree: Any) -> dict[str, np.ndarray]:

@@ -1,6 +1,8 @@
 import errno
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -371,3 +373,35 @@ def test_keys_and_numpys_arrays_come_back_as_such(tmp_path):
     found["a"][0] = 7.0  # it is one's own
     shapes = {**tree, "b": jax.ShapeDtypeStruct((2,), jnp.float32)}
     assert bits(storage.load(tmp_path, "thing", shapes)) == bits(tree)
+
+
+HOLD = "import fcntl, sys; f = open(sys.argv[1], 'w'); fcntl.flock(f, 2); print('held'); input()"
+
+
+def test_one_process_works_in_a_folder_until_it_ends_however_it_ends(tmp_path):
+    command = [sys.executable, "-u", "-c", HOLD, str(tmp_path / "lock")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(StorageError, match="another process is at work") as found:  # noqa: SIM117
+            with storage.locked(tmp_path, "lock"):
+                pytest.fail("two are inside")
+        assert str(tmp_path) in str(found.value)
+        other.kill()
+        other.wait()
+    for _ in range(2):
+        with storage.locked(tmp_path, "lock"):
+            pass
+
+
+def test_a_lock_that_was_removed_before_it_was_got_is_none(tmp_path, monkeypatch):
+    monkeypatch.setattr(storage.fcntl, "flock", lambda *_: (tmp_path / "lock").unlink())
+    with pytest.raises(StorageError, match="has just finished"), storage.locked(tmp_path, "lock"):
+        pytest.fail("it is inside")
+    with pytest.raises(StorageError, match="cannot be written"):
+        storage.locked(tmp_path / "nowhere", "lock").__enter__()
+
+
+def test_a_file_system_without_locks_is_worked_on_without_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(storage.fcntl, "flock", fail)
+    with storage.locked(tmp_path, "lock"):
+        pass

@@ -48,8 +48,14 @@ def test_number_returns_a_value_within_the_rules(value, rules):
         (1.5, {"most": 1}, "a finite number, at most 1"),
         (0, {"above": 0}, "a finite number, above 0"),
         (2, {"above": 2, "most": 3}, "a finite number, above 2, at most 3"),
-        (2.5, {"integer": True}, "an integer"),
-        (2.0, {"integer": True}, "an integer"),  # shapes and counts must be of an integer type
+        (2.5, {"integer": True}, r"an integer, at most 2e\+09"),
+        (10**10, {"integer": True}, r"an integer, at most 2e\+09"),
+        (10**39, {}, "a finite number"),  # not in single precision
+        (
+            2.0,
+            {"integer": True},
+            r"an integer, at most 2e\+09",
+        ),  # shapes and counts must be of an integer type
         (0, {"integer": True, "least": 1, "most": 9}, "an integer, at least 1, at most 9"),
         (float("inf"), {}, "a finite number"),
         (float("-inf"), {"infinite": True, "least": 0}, "a number, at least 0"),

@@ -27,6 +27,8 @@ class Outcome(struct.PyTreeNode):
 
 
 BASELINES = ("paper", "plans")  # policies that threats are measured under
+SMALLEST = 0.02  # radius of a vehicle, at least: two cells of the table of distances to walls
+FARTHEST = 30  # steps within which wall points are hit, at most: the look-up tables grow with it
 
 
 class Hazards(NamedTuple):

@@ -21,7 +21,7 @@ from rp_jax.kinematics import (
     rotate,
     to_ego,
 )
-from rp_jax.validate import one_of, positive
+from rp_jax.validate import number, one_of, positive
 
 ACCELERATIONS = (-0.02, 0.0, 0.02)  # room units / step^2
 TURNS = (-0.15, -0.05, 0.0, 0.05, 0.15)  # radians / step
@@ -81,10 +81,10 @@ def make_params(
     one_of("fidelity", fidelity, FIDELITIES)
     one_of("baseline", baseline, base.BASELINES)
     positive("time_limit", time_limit, most=10**9, integer=True)
-    positive("horizon", horizon, most=100, integer=True)
-    positive("radius", radius)
+    positive("horizon", horizon, most=base.FARTHEST, integer=True)
+    number("radius", radius, least=base.SMALLEST, most=tracks.LARGEST)
     positive("beta", beta, most=1.0)
-    if isinstance(track, str):
+    if not isinstance(track, tracks.TrackPlan):
         track = tracks.PLANS[one_of("track", track, tracks.PLANS)]()
     plans = baseline == "plans"
     agent = AgentModel(

@@ -124,11 +124,11 @@ def make_params(
     one_of("fidelity", fidelity, FIDELITIES)
     one_of("baseline", baseline, base.BASELINES)
     positive("time_limit", time_limit, most=10**9, integer=True)
-    positive("radius", radius, most=0.2)
+    number("radius", radius, least=base.SMALLEST, most=0.2)
     room = int((ROOM / (2 * radius)) ** 2)  # how many fit, side by side
     number("num_obstacles", num_obstacles, least=1, most=room, integer=True)
     positive("beta", beta, most=1.0)
-    positive("wall_horizon", wall_horizon, most=100, integer=True)
+    positive("wall_horizon", wall_horizon, most=base.FARTHEST, integer=True)
     positive("obstacle_horizon", obstacle_horizon, most=100, integer=True)
     plans = baseline == "plans"
     agent = AgentModel(

@@ -9,10 +9,14 @@ from jax import Array
 from scipy.spatial import cKDTree
 
 from rp_jax import sensing
+from rp_jax.validate import number, positive, shown
 
 SPACING = 0.02  # of points along straights, room units
 CELL = 0.2  # width of the look-up cells, room units
 VIEW = 1.0  # range of the LIDAR, room units
+LONGEST = 10_000  # points of a centre line, at most
+WIDEST = 5.0  # half-width, room units
+LARGEST = 50.0  # side of the square that a track has to fit into, room units
 
 
 @dataclass(frozen=True)
@@ -40,8 +44,7 @@ class TrackPlan:
 
     def straight(self, length: float) -> "TrackPlan":
         """Goes straight on for `length` > 0, rounded up to whole steps of SPACING."""
-        if not (np.isfinite(length) and length > 0):
-            raise ValueError(f"straight: length is {length}; it must be positive and finite")
+        positive("straight: length", length, most=SPACING * LONGEST)
         count = int(np.ceil(length / SPACING - 1e-6))
         way = np.arange(count + 1)[:, None] * SPACING
         points = np.asarray(self.position) + way * [np.cos(self.angle), np.sin(self.angle)]
@@ -49,9 +52,9 @@ class TrackPlan:
 
     def curve(self, radius: float, degrees: float) -> "TrackPlan":
         """Turns by whole `degrees` (left is positive) on a circle of `radius` > 0."""
-        if not (np.isfinite(radius) and radius > 0):
-            raise ValueError(f"curve: radius is {radius}; it must be positive and finite")
-        if not np.isfinite(degrees) or degrees == 0 or degrees != round(degrees):
+        positive("curve: radius", radius, most=LARGEST)
+        number("curve: degrees", degrees, least=-LONGEST, most=LONGEST)
+        if degrees == 0 or degrees != round(degrees):
             raise ValueError(f"curve: degrees is {degrees}; it must be a whole number, not 0")
         side = np.sign(degrees)
         turn = np.radians(np.arange(abs(int(degrees)) + 1)) * side
@@ -63,6 +66,7 @@ class TrackPlan:
 
     def close(self, radius: float = 0.3) -> "TrackPlan":
         """Drives home to the start: straight, one turn of `radius`, straight along +x."""
+        positive("close: radius", radius, most=LARGEST)
         left = (-np.degrees(self.angle) + 180) % 360 - 180
         turn = round(left)
         if abs(left - turn) > 1e-6:
@@ -140,10 +144,10 @@ def make_track(plan: TrackPlan, radius: float, reach: float) -> Track:
     Raises:
         ValueError: the track is too narrow, not closed, or crosses itself.
     """
+    _check_plan(plan, radius)
     centre, angles = plan.points, plan.angles
     direction = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     left = np.stack([-direction[:, 1], direction[:, 0]], axis=-1) * plan.half_width
-    _check_plan(plan, radius)
     walls = np.stack([centre + left, centre - left], axis=1).reshape(-1, 2)
     # Coinciding points (the hub of a tight turn) are one event: counting it once keeps
     # Theorem 3's bound, and makes it tighter.
@@ -170,14 +174,42 @@ def make_track(plan: TrackPlan, radius: float, reach: float) -> Track:
     )
 
 
+def _check_shape(plan: TrackPlan) -> None:
+    """What look-up tables could not be made of, or only of a size that nobody means."""
+    if not isinstance(plan, TrackPlan):
+        raise ValueError(f"track is {shown(plan)}; it must be a TrackPlan")
+    for name, tail in {"points": (2,), "angles": ()}.items():
+        values = getattr(plan, name)
+        good = isinstance(values, np.ndarray) and values.dtype.kind == "f" and values.ndim > 0
+        if not good or values.shape[1:] != tail or not np.isfinite(values).all():
+            shape = "(n, 2)" if tail else "(n,)"
+            raise ValueError(
+                f"track: {name} is {shown(values)}; it must be finite floats of shape {shape}"
+            )
+    number("track: centre points", len(plan.points), least=8, most=LONGEST, integer=True)
+    if len(plan.angles) != len(plan.points):
+        raise ValueError(
+            f"track: angles is {shown(plan.angles)}; it must be one for each of the "
+            f"{len(plan.points)} points"
+        )
+    width, height = np.ptp(plan.points, axis=0)
+    number("track: width", float(width), most=LARGEST)
+    number("track: height", float(height), most=LARGEST)
+    if not isinstance(plan.position, tuple) or len(plan.position) != 2:
+        raise ValueError(f"track: position is {plan.position!r}; it must be two numbers")
+    for place in plan.position:
+        number("track: position", place)
+    number("track: angle", plan.angle)
+
+
 def _check_plan(plan: TrackPlan, radius: float) -> None:
+    _check_shape(plan)
+    number("track: half_width", plan.half_width, most=WIDEST)
     centre, width = plan.points, plan.half_width
-    if not (np.isfinite(width) and width > radius):
+    if width <= radius:
         raise ValueError(
             f"track: half_width is {width}; it must exceed the vehicle's radius, {radius}"
         )
-    if len(centre) < 8:
-        raise ValueError(f"track: {len(centre)} centre points; at least 8 are needed")
     gap = np.linalg.norm(np.asarray(plan.position) - centre[0])
     turn = np.angle(np.exp(1j * (plan.angle - plan.angles[0])))
     if gap > 3 * SPACING or abs(turn) > np.radians(2):

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import flashbax
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from flax import linen as nn
 from jax import Array
@@ -18,8 +17,8 @@ from rp_jax.planning import dqn
 from rp_jax.planning.dqn import DQNConfig, Learner, Transition
 from rp_jax.planning.networks import NETWORKS
 from rp_jax.planning.nstep import Taken, n_step_transition
-from rp_jax.planning.pmdp import PMDP, Encoded, not_finite
-from rp_jax.validate import finite, number, one_of
+from rp_jax.planning.pmdp import PMDP, Encoded, faults
+from rp_jax.validate import finite, none_bad, number, one_of, random_key
 
 
 @dataclass(frozen=True)
@@ -187,6 +186,7 @@ def interact(
         next_admissible=seen.bits,
     )
     score, danger = state.score + outcome.reward, state.danger + outcome.danger
+    bad_observation, bad_threat = faults(state.seen.encoded, state.seen.threat)
     metrics = Metrics(
         steps=jnp.asarray(batch, score.dtype),
         episodes=jnp.sum(outcome.done, dtype=score.dtype),
@@ -197,8 +197,8 @@ def interact(
         insecure=jnp.sum(jnp.min(state.seen.threat, axis=-1) > pmdp.x, dtype=score.dtype),
         inadmissible=jnp.sum(_inadmissible(state.seen.threat, action, pmdp.x), dtype=score.dtype),
         loss=jnp.zeros((), score.dtype),
-        bad_observations=jnp.sum(not_finite(state.seen.encoded.rest), dtype=score.dtype),
-        bad_threats=jnp.sum(not_finite(state.seen.threat), dtype=score.dtype),
+        bad_observations=jnp.sum(bad_observation, dtype=score.dtype),
+        bad_threats=jnp.sum(bad_threat, dtype=score.dtype),
         bad_rewards=jnp.sum(~jnp.isfinite(taken.reward), dtype=score.dtype),
     )
     window = jax.tree.map(
@@ -222,7 +222,13 @@ def _inadmissible(threat: Array, action: Array, x: Array) -> Array:
 
 
 def init(key: Array, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics]:
-    """Starts all environments and a learner, and fills the replay up to `replay_start`."""
+    """Starts all environments and a learner, and fills the replay up to `replay_start`.
+
+    Raises:
+        ValueError: a setting is out of range.
+    """
+    config.validate("config")
+    random_key("key", key)
     reset_key, net_key, warm_key, key = jax.random.split(key, 4)
     batch = config.num_envs
     network, replay = make_network(config, pmdp), make_replay(config)
@@ -303,6 +309,7 @@ def chunk(
     state: LoopState, pmdp: PMDP, config: LoopConfig, iterations: int
 ) -> tuple[LoopState, Metrics]:
     """`iterations` of: collect, then learn `config.updates` times. Metrics are summed."""
+    number("iterations", iterations, least=1, integer=True)
 
     def iteration(state: LoopState, _) -> tuple[LoopState, Metrics]:
         state, metrics = collect(state, pmdp, config)
@@ -322,10 +329,7 @@ def check(params: Any, metrics: Metrics) -> None:
 
     The weights tell of gradients: Adam never forgets one that is not finite.
     """
-    for name in ("observations", "threats", "rewards"):
-        count = int(np.sum(getattr(metrics, f"bad_{name}")))
-        if count:
-            raise FloatingPointError(f"planning: {name} of {count:,} steps are nan or infinite")
+    none_bad("planning", metrics)
     finite("planning: losses", metrics.loss)
     for leaf in jax.tree.leaves(params):
         finite("planning: weights, after a gradient that was not,", leaf)

@@ -32,11 +32,15 @@ class Percept(NamedTuple):
     secure: Array  # (B,) bool
     threat: Array  # (B, A)
 
-    def faults(self) -> tuple[Array, Array]:
-        """(B,) bool each: the observation, or the threats, hold a number that is none."""
-        seen = [leaf for leaf in jax.tree.leaves(self.encoded) if leaf.dtype.kind == "f"]
-        bad = [not_finite(leaf.reshape(len(leaf), -1)) for leaf in seen]
-        return jnp.any(jnp.stack(bad), axis=0), not_finite(self.threat)
+
+def faults(encoded: Encoded, threat: Array) -> tuple[Array, Array]:
+    """(B,) bool each: an observation (B, ...), or the threats (B, A), hold a number that is none.
+
+    What is not floating point cannot.
+    """
+    seen = [leaf for leaf in jax.tree.leaves(encoded) if leaf.dtype.kind == "f"]
+    bad = [not_finite(leaf.reshape(len(leaf), -1)) for leaf in seen]
+    return jnp.any(jnp.stack(bad), axis=0), not_finite(threat)
 
 
 def not_finite(values: Array) -> Array:

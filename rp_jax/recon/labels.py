@@ -20,7 +20,7 @@ from rp_jax import devices
 from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
 from rp_jax.hazards import SubRMDP
 from rp_jax.kinematics import AgentModel, ControlDistribution, Plans
-from rp_jax.validate import finite
+from rp_jax.validate import finite, leading, number, random_key
 
 
 class Labels(struct.PyTreeNode):
@@ -188,8 +188,9 @@ def leaves(sub: SubRMDP) -> int:
 def best_estimator(sub: SubRMDP, paths: int) -> Estimator:
     """Exact enumeration where the hazard stays put and the tree is small enough.
 
-    Elsewhere Monte Carlo with `paths` rollouts.
+    Elsewhere Monte Carlo with `paths` rollouts, at least 1.
     """
+    number("paths", paths, least=1, integer=True)
     if isinstance(sub.agent.baseline, Plans):
         return _sampled(plan_threat, paths)
     if sub.source.static and leaves(sub) <= MOST_LEAVES:
@@ -254,10 +255,13 @@ def label(
         checkpoints: of these labels.
 
     Raises:
+        ValueError: a count is not above 0, or there are not as many agents as hazards.
         FloatingPointError: a label is not a finite number.
     """
-    count = jax.tree.leaves(agent)[0].shape[0]
-    rows = min(rows, count)
+    random_key("key", key)
+    count = leading(agent=agent, hazard=hazard)
+    number("batch", batch, least=1, integer=True)
+    rows = min(int(number("rows", rows, least=1, integer=True)), count)
     rows += 0 if mesh is None else -rows % mesh.size
     first = jax.tree.map(lambda a: a[0], (agent, hazard))
     one = jax.eval_shape(estimator, key, *first, sub)

@@ -10,10 +10,9 @@ import numpy as np
 
 from rp_jax import storage
 from rp_jax.hazards import SubRMDP
-from rp_jax.threat.model import ACTIVATIONS, ThreatModel, ThreatNetwork
+from rp_jax.threat.model import ACTIVATIONS, DEEPEST, WIDEST, ThreatModel, ThreatNetwork
 
 KIND = "threat function"
-WIDEST = 4096  # units of a layer
 
 
 def save(
@@ -78,12 +77,12 @@ def _blank(folder: Path, kind: str, facts: Any, sub: SubRMDP) -> ThreatModel:
     hidden = facts.get("hidden") if isinstance(facts, dict) else None
     if (
         not isinstance(hidden, list)
-        or len(hidden) > 16
-        or not all(isinstance(width, int) and 0 < width <= WIDEST for width in hidden)
+        or len(hidden) > DEEPEST
+        or not all(type(width) is int and 0 < width <= WIDEST for width in hidden)
     ):
         raise storage.StorageError(
-            f"{folder}: {kind}: hidden is {hidden!r}; it must list up to 16 widths of at most "
-            f"{WIDEST}"
+            f"{folder}: {kind}: hidden is {hidden!r}; it must list up to {DEEPEST} widths "
+            f"of at most {WIDEST}"
         )
     if facts.get("activation") not in list(ACTIVATIONS):
         raise storage.StorageError(

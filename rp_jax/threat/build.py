@@ -19,7 +19,7 @@ from rp_jax.recon import labels, sampling
 from rp_jax.threat import fit, report
 from rp_jax.threat.fit import Dataset, FitConfig
 from rp_jax.threat.model import ThreatModel
-from rp_jax.validate import finite, number, one_of
+from rp_jax.validate import finite, leading, number, one_of, random_key
 
 Progress = Callable[[str, int, int], None]  # (stage, done, total)
 SAMPLINGS = ("uniform", "preferential")
@@ -48,6 +48,8 @@ class ThreatConfig:
         number(f"{name}.test_states", self.test_states, least=10, integer=True)
         number(f"{name}.test_paths", self.test_paths, least=2, integer=True)
         self.fit.validate(f"{name}.fit")
+        first = self.states // 2 if self.sampling == "preferential" else self.states
+        number(f"{name}.fit.validation", self.fit.validation, least=1 / first)
 
 
 class Built(NamedTuple):
@@ -84,8 +86,12 @@ def fitted(
     """Fits a model to labelled states and their mirror images; returns it and its curve.
 
     Raises:
+        ValueError: a setting is out of range, or there are not as many labels as states.
         FloatingPointError: the loss, or a weight after a step, is not a finite number.
     """
+    random_key("key", key)
+    config.validate("config")
+    leading(features=data.features, threat=data.threat)
     split_key, init_key = jax.random.split(key)
     train, held = fit.split(split_key, data, config.validation)
     train = fit.mirror(train, sub)
@@ -194,8 +200,12 @@ def build(
         checkpoints: of its labels and fits.
 
     Raises:
+        ValueError: a setting is out of range.
         FloatingPointError: a label, a loss or a weight is not a finite number.
     """
+    random_key("key", key)
+    config.validate("config")
+    number("x", x, least=0, infinite=True)
     keys = jax.random.split(key, 9)
     estimator = labels.best_estimator(sub, config.paths)
     accurate = labels.best_estimator(sub, config.test_paths)
@@ -205,7 +215,7 @@ def build(
     at = checkpoints.at
     data = _labelled(keys[1], features, sub, estimator, "labels", on_progress, mesh, checkpoints)
     if config.sampling == "preferential":
-        short = dataclasses.replace(config.fit, steps=config.fit.steps // 4)
+        short = dataclasses.replace(config.fit, steps=max(1, config.fit.steps // 4))
         scout, _ = fitted(keys[2], sub, data, short, on_progress, checkpoints=at("scout"))
         more = sampling.preferential(
             keys[3], sub, scout, data.features, data.threat, x, config.states - first

@@ -9,8 +9,8 @@ import optax
 from jax import Array
 
 from rp_jax.hazards import SubRMDP
-from rp_jax.threat.model import ACTIVATIONS, ThreatModel, ThreatNetwork
-from rp_jax.validate import number, one_of
+from rp_jax.threat.model import ACTIVATIONS, DEEPEST, WIDEST, ThreatModel, ThreatNetwork
+from rp_jax.validate import number, one_of, shown
 
 
 class Dataset(NamedTuple):
@@ -35,10 +35,11 @@ class FitConfig:
 
     def validate(self, name: str) -> None:
         """Raises ValueError, naming the field after `name`, if a value is out of range."""
-        if not self.hidden:
-            raise ValueError(f"{name}.hidden is {self.hidden}; it must name at least one width")
+        if not isinstance(self.hidden, tuple) or not 0 < len(self.hidden) <= DEEPEST:
+            allowed = f"1 to {DEEPEST} widths"
+            raise ValueError(f"{name}.hidden is {shown(self.hidden)}; it must be {allowed}")
         for width in self.hidden:
-            number(f"{name}.hidden", width, least=1, most=4096, integer=True)
+            number(f"{name}.hidden", width, least=1, most=WIDEST, integer=True)
         one_of(f"{name}.activation", self.activation, ACTIVATIONS)
         number(f"{name}.steps", self.steps, least=1, integer=True)
         number(f"{name}.batch", self.batch, least=1, integer=True)

@@ -10,6 +10,7 @@ from flax import struct
 from jax import Array
 
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"relu": nn.relu, "silu": nn.silu}
+DEEPEST, WIDEST = 16, 4096  # layers of a network, and units of a layer, at most
 
 
 class ThreatNetwork(nn.Module):

@@ -454,7 +454,10 @@ def test_the_walls_stand_around_the_room_but_not_in_the_exit(golden):
         ({"num_obstacles": 2.5}, r"^num_obstacles is 2\.5; it must be an integer"),
         ({"num_obstacles": 10_000}, "^num_obstacles is 10000; it must be .* at most"),
         ({"time_limit": -1}, "^time_limit is -1; it must be an integer, above 0"),
-        ({"radius": 0.5}, r"^radius is 0\.5; it must be a finite number, above 0, at most 0\.2"),
+        (
+            {"radius": 0.5},
+            r"^radius is 0\.5; it must be .* at least 0\.02, at most 0\.2",
+        ),
         ({"beta": 0}, "^beta is 0; it must be a finite number, above 0, at most 1"),
         ({"wall_horizon": 0}, "^wall_horizon is 0; it must be an integer"),
         ({"obstacle_horizon": 0.5}, r"^obstacle_horizon is 0\.5; it must be an integer"),

@@ -3,8 +3,8 @@
 import dataclasses
 import json
 
+import forked
 import jax
-import killed
 import pytest
 from tiny import programs_of_a_moment  # noqa: F401
 
@@ -13,14 +13,14 @@ from rp_jax import checkpoints, evaluate, storage
 
 
 def call(*argv, name="killed"):
-    presets, make_task = killed.corridor()
-    return cli.main(name, killed.__doc__, presets, make_task, [str(word) for word in argv])
+    presets, make_task = forked.corridor()
+    return cli.main(name, forked.__doc__, presets, make_task, [str(word) for word in argv])
 
 
 @pytest.fixture
 def begun(tmp_path):
     """A run that was stopped at its very beginning."""
-    presets, _ = killed.corridor()
+    presets, _ = forked.corridor()
     folder = tmp_path / "run"
     folder.mkdir()
     plain = {"preset": "quick", "task": "corridor", **dataclasses.asdict(presets["quick"]("tuned"))}
@@ -81,7 +81,7 @@ def test_a_run_stopped_by_nan_goes_on_to_the_same_bits(tmp_path, monkeypatch, ca
         said = " ".join(capsys.readouterr().out.split())
         assert "error: slip 0.3: threats of 7 steps" in said
         assert f"to go on: python -m killed --resume {folder}" in said
-        assert killed.stage(folder) == "evaluation"
+        assert (folder / "checkpoints" / "evaluation").exists()
         assert call("--resume", folder) == folder
-    assert killed.outcome(folder) == killed.outcome(alone)
+    assert forked.outcome(folder) == forked.outcome(alone)
     assert not (folder / "checkpoints").exists()
