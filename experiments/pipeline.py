@@ -277,19 +277,23 @@ def plan(
     with console.progress("planning") as bar:
         bar("", 0, chunks, "compiling")
         began = time.perf_counter()
-        begin = functools.partial(loop.init, config=planning)
-        init = jax.jit(devices.spread(begin, (0, axes), mesh))
-        start = init.lower(keys, pmdp).compile()
-        onward = functools.partial(loop.chunk, config=planning, iterations=length)
-        chunk = jax.jit(devices.spread(onward, (0, axes), mesh), donate_argnums=0)
-        shapes, _ = jax.eval_shape(init, keys, pmdp)
-        step = chunk.lower(devices.placed(shapes, mesh), pmdp).compile()
+        start = functools.partial(loop.begin, config=planning)
+        begin = jax.jit(devices.spread(start, (0, axes), mesh))
+
+        def onward(state: loop.LoopState, pmdp: PMDP, iterations: jax.Array, updates: jax.Array):
+            return loop.chunk(state, pmdp, planning, iterations, updates)
+
+        # One program fills the replay and learns: its compilation takes longer than all else.
+        chunk = jax.jit(devices.spread(onward, (0, axes, None, None), mesh), donate_argnums=0)
+        shapes = devices.placed(jax.eval_shape(begin, keys, pmdp), mesh)
+        step = chunk.lower(shapes, pmdp, length, planning.updates).compile()
+        first = begin.lower(keys, pmdp).compile()
         compiled = now = time.perf_counter()
 
         def advance(i: int, carried: tuple[loop.LoopState, Record]):
             nonlocal now
             state, record = carried
-            state, new = step(state, pmdp)
+            state, new = step(state, pmdp, length, planning.updates)
             for whole, part in zip(record.metrics, devices.gather(new, mesh), strict=True):
                 whole[i] += part
             params = devices.gather(state.learner.params, mesh)
@@ -301,7 +305,7 @@ def plan(
             bar("", i + 1, chunks, _note(rows[-len(members) :]))
             return state, record
 
-        state, metrics = start(keys, pmdp)
+        state, metrics = step(first(keys, pmdp), pmdp, planning.filling, 0)
         metrics = devices.gather(metrics, mesh)
         blank = jax.tree.map(lambda m: np.zeros((chunks, *m.shape), m.dtype), metrics)
         for whole, part in zip(blank, metrics, strict=True):

@@ -81,7 +81,7 @@ def load(folder: Path) -> Run:
         used.append(threats / "manifest.json")
     pmdp = pipeline.make_pmdp(task, config, models, task.train)
     shapes = jax.eval_shape(
-        lambda key: loop.init(key, pmdp, config.planning)[0].learner.params, jax.random.key(0)
+        lambda key: loop.begin(key, pmdp, config.planning).learner.params, jax.random.key(0)
     )
     like = jax.tree.map(lambda s: jax.ShapeDtypeStruct((config.seeds, *s.shape), s.dtype), shapes)
     params = storage.load(folder / "agent", "Q-network", like)

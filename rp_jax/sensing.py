@@ -1,5 +1,8 @@
 """What a vehicle perceives of fixed points: neighbour look-up and LIDAR."""
 
+import math
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -135,12 +138,27 @@ def distance_field(
     )
 
 
-def bin_edges(bins: int) -> Array:
-    """Directions (bins + 1, 2) of the edges of equal angular bins, from -pi to pi."""
-    angle = np.arange(bins + 1) * (2 * np.pi / bins) - np.pi
-    edges = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    # Exact along the axes, so that a point straight ahead or behind is on an edge.
-    return jnp.asarray(np.where(np.abs(edges) < 1e-9, 0.0, edges), float)
+def edge_direction(number: Array, bins: int) -> tuple[Array, Array]:
+    """(cos, sin) of the edges numbered (...) of equal angular bins, from 0 at -pi to `bins` at pi.
+
+    Exact along the axes, so that a point straight ahead or behind is on an edge. Series, since a
+    look-up in a table of them (and the library's functions) cannot be vectorised.
+    """
+    dtype = jax.dtypes.canonicalize_dtype(float)
+    fourfold = 4 * number.astype(dtype)
+    quarters = jnp.round(fourfold * (1 / bins))
+    rest = (fourfold - bins * quarters) * (jnp.pi / 2 / bins)  # exact, times pi / 4 at most
+    square = rest * rest
+    cos, sin = jnp.zeros_like(rest), jnp.zeros_like(rest)
+    for n in range(7 if dtype == jnp.float64 else 4, -1, -1):  # Taylor's, exact to rounding
+        sign = (-1) ** n
+        cos = cos * square + sign / math.factorial(2 * n)
+        sin = sin * square + sign / math.factorial(2 * n + 1)
+    sin = sin * rest
+    turns = quarters.astype(jnp.int32)
+    odd, ahead = turns & 1 == 1, turns & 2 == 2
+    x, y = jnp.where(odd, sin, -cos), jnp.where(odd, -cos, -sin)
+    return jnp.where(ahead, -x, x), jnp.where(ahead, -y, y)
 
 
 def _approximate_angle(x: Array, y: Array) -> Array:
@@ -155,30 +173,37 @@ def _approximate_angle(x: Array, y: Array) -> Array:
     return jnp.where(y < 0, -p, p)
 
 
-def lidar(points: Array, position: Array, heading: Array, edges: Array, view: float = 1.0) -> Array:
+def lidar(points: Array, position: Array, heading: Array, bins: int, view: float = 1.0) -> Array:
     """Distance of the nearest point in each angular bin around the heading.
 
     Args:
         points: (P, 2) world coordinates.
         position: (2,) of the sensor.
-        heading: (2,) unit vector; bin k spans the angles between edges k and k + 1 from it.
-        edges: (bins + 1, 2) from `bin_edges`. Bins are open: a point on an edge is not seen.
+        heading: (2,) unit vector.
+        bins: equal ones, from straight behind over the right to straight behind again. They are
+            open: a point on an edge is not seen.
         view: points at this distance or farther are not seen.
 
     Returns:
         (bins,) distances, 0 where nothing is seen.
     """
-    bins = edges.shape[0] - 1
     local = to_ego(points - position[None], heading)
     x, y = local[:, 0], local[:, 1]
     # The nearest edge comes from the approximate angle, the side of it from the exact vectors.
     turn = (_approximate_angle(x, y) + jnp.pi) * (bins / (2 * jnp.pi))
     nearest = jnp.clip(jnp.round(turn).astype(jnp.int32), 0, bins)
-    edge = edges[nearest]
-    cross = edge[:, 0] * y - edge[:, 1] * x
-    k = jnp.where(cross > 0, nearest, nearest - 1) % bins
+    cos, sin = edge_direction(nearest, bins)
+    cross = cos * y - sin * x
+    k = jnp.where(cross > 0, nearest, nearest - 1)
+    k = jnp.where(k < 0, bins - 1, jnp.where(k < bins, k, 0))
     squared = x * x + y * y
     seen = (squared < view * view) & (cross != 0)
-    best = jnp.full(bins, jnp.inf, squared.dtype)
-    best = best.at[k].min(jnp.where(seen, squared, jnp.inf), mode="promise_in_bounds")
+    # What is not seen goes to a spare bin. Numbers that are not negative are ordered as their bits
+    # are, and minima of integers are found faster.
+    integer = jnp.dtype(f"int{8 * squared.dtype.itemsize}")
+    bits = jax.lax.bitcast_convert_type(squared, integer)
+    none = jax.lax.bitcast_convert_type(jnp.asarray(jnp.inf, squared.dtype), integer)
+    best = jnp.full(bins + 1, none)
+    best = best.at[jnp.where(seen, k, bins)].min(bits, mode="promise_in_bounds")[:bins]
+    best = jax.lax.bitcast_convert_type(best, squared.dtype)
     return jnp.where(jnp.isinf(best), 0.0, jnp.sqrt(best))

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from rp_jax.sensing import FAR, bin_edges, lidar, nearest_of, points_within
+from rp_jax.sensing import FAR, edge_direction, lidar, nearest_of, points_within
 
-scan = jax.jit(lidar)
+scan = jax.jit(lidar, static_argnums=3)
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -43,9 +43,7 @@ def test_lidar_finds_the_nearest_point_of_each_bin(points, position, angle, bins
     points = np.where(clear[:, None], points, FAR)
     expected, _, _ = brute_force(points, position, angle, bins, view)
     with jax.enable_x64(True):
-        found = scan(
-            jnp.asarray(points), jnp.asarray(position), heading_of(angle), bin_edges(bins), view
-        )
+        found = scan(jnp.asarray(points), jnp.asarray(position), heading_of(angle), bins, view)
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
@@ -58,7 +56,7 @@ def test_lidar_in_single_precision_errs_only_within_rounding_of_an_edge(seed):
     clear = (aside > 1e-6) & (distance > 1e-3) & (np.abs(distance - 1) > 1e-6)
     points[~clear] = FAR
     expected, _, _ = brute_force(points, 0.0, angle, 360, 1.0)
-    found = scan(jnp.asarray(points), jnp.zeros(2), heading_of(angle), bin_edges(360))
+    found = scan(jnp.asarray(points), jnp.zeros(2), heading_of(angle), 360)
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
@@ -67,7 +65,7 @@ def test_lidar_in_single_precision_errs_only_within_rounding_of_an_edge(seed):
 )
 def test_bins_count_from_behind_over_the_right_and_the_front_to_the_left(degrees, seen_in):
     point = 0.5 * np.asarray([[np.cos(np.radians(degrees)), np.sin(np.radians(degrees))]])
-    found = scan(jnp.asarray(point, float), jnp.zeros(2), heading_of(0.0), bin_edges(360))
+    found = scan(jnp.asarray(point, float), jnp.zeros(2), heading_of(0.0), 360)
     np.testing.assert_allclose(found, 0.5 * (np.arange(360) == seen_in), atol=1e-6)
 
 
@@ -76,44 +74,49 @@ def test_bins_turn_with_the_heading_and_move_with_the_sensor():
     angle = np.radians(degrees + 20.5)
     point = np.asarray([[3.0 + 0.25 * np.cos(angle), -2.0 + 0.25 * np.sin(angle)]])
     position = jnp.asarray([3.0, -2.0])
-    found = scan(jnp.asarray(point, float), position, heading_of(np.radians(37.5)), bin_edges(360))
+    found = scan(jnp.asarray(point, float), position, heading_of(np.radians(37.5)), 360)
     np.testing.assert_allclose(found, 0.25 * (np.arange(360) == 200), atol=1e-6)
 
 
 def test_bins_are_open_so_a_point_straight_ahead_is_not_seen():
     ahead = jnp.asarray([[0.5, 0.0], [0.25, 0.0]])
-    assert not scan(ahead, jnp.zeros(2), heading_of(0.0), bin_edges(360)).any()
+    assert not scan(ahead, jnp.zeros(2), heading_of(0.0), 360).any()
 
 
 def test_every_direction_of_an_edge_falls_between_its_two_bins(x64):
-    edges = bin_edges(360)
     for k in range(360):
         for side, expected in ((1e-9, k), (-1e-9, (k - 1) % 360)):
             angle = np.radians(k - 180) + side
             point = jnp.asarray([[0.5 * np.cos(angle), 0.5 * np.sin(angle)]])
-            found = scan(point, jnp.zeros(2), heading_of(0.0), edges)
+            found = scan(point, jnp.zeros(2), heading_of(0.0), 360)
             assert np.flatnonzero(found).tolist() == [expected]
 
 
 @pytest.mark.parametrize(("distance", "seen"), [(0.999, True), (1.0, False), (1.001, False)])
 def test_points_at_the_end_of_the_view_or_farther_are_not_seen(distance, seen):
     point = distance * jnp.asarray([[0.6, 0.8]])
-    found = scan(point, jnp.zeros(2), jnp.asarray([1.0, 0.0]), bin_edges(360))
+    found = scan(point, jnp.zeros(2), jnp.asarray([1.0, 0.0]), 360)
     assert bool(found.any()) == seen
 
 
 def test_neither_padding_nor_a_point_at_the_sensor_is_seen():
     points = jnp.asarray([[FAR, FAR], [0.0, 0.0]])
-    found = scan(points, jnp.zeros(2), heading_of(0.3), bin_edges(360))
+    found = scan(points, jnp.zeros(2), heading_of(0.3), 360)
     np.testing.assert_array_equal(found, np.zeros(360))
 
 
-def test_the_edges_are_unit_vectors_one_more_than_the_bins():
-    edges = np.asarray(bin_edges(12), np.float64)
-    assert edges.shape == (13, 2)
-    angles = np.unwrap(np.arctan2(edges[:, 1], edges[:, 0]))
-    np.testing.assert_allclose(np.diff(angles), np.pi / 6, atol=1e-6)
-    np.testing.assert_allclose(edges[0], [-1, 0], atol=1e-6)
+@pytest.mark.parametrize("bins", [360, 45, 12, 1])
+def test_the_edges_divide_the_circle(precision, bins):
+    number = np.arange(bins + 1)
+    x, y = map(np.asarray, edge_direction(jnp.asarray(number), bins))
+    assert x.dtype == precision
+    angles = number * (2 * np.pi / bins) - np.pi
+    atol = {"float64": 1e-15, "float32": 2e-7}[precision]
+    np.testing.assert_allclose(x, np.cos(angles), rtol=0, atol=atol)
+    np.testing.assert_allclose(y, np.sin(angles), rtol=0, atol=atol)
+    axes = 4 * number % bins == 0
+    assert axes.sum() >= 2
+    np.testing.assert_array_equal(np.sort(np.abs([x, y])[:, axes], axis=0)[0], 0)  # exactly
 
 
 def look_up(method, positions):
@@ -173,4 +176,4 @@ def test_of_equally_near_points_the_first_is_returned():
 
 def test_points_on_the_axes_are_on_an_edge():
     points = jnp.asarray([[0.0, 0.5], [-0.5, 0.0], [0.0, -0.5]])
-    assert not lidar(points, jnp.zeros(2), jnp.asarray([1.0, 0.0]), bin_edges(360)).any()
+    assert not lidar(points, jnp.zeros(2), jnp.asarray([1.0, 0.0]), 360).any()

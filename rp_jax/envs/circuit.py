@@ -46,7 +46,6 @@ class Params(struct.PyTreeNode):
     wall: WallPoint
     track: tracks.Track
     walls: sensing.DistanceField | None  # for plans
-    edges: Array  # (361, 2) directions of the LIDAR bins' edges
     time_limit: Array  # () int32, steps
     stop_speed: Array  # () slower than this costs 1
     beta: Array  # () discount of danger
@@ -104,7 +103,6 @@ def make_params(
         wall=wall,
         track=made,
         walls=sensing.distance_field(np.asarray(made.walls), radius) if plans else None,
-        edges=sensing.bin_edges(LIDAR_BINS),
         time_limit=jnp.asarray(time_limit, jnp.int32),
         stop_speed=jnp.asarray(0.005, float),
         beta=jnp.asarray(beta, float),
@@ -171,7 +169,7 @@ def observe(state: State, params: Params) -> Array:
     """(364,) LIDAR (360), x, y, direction of the track relative to the heading, speed."""
     agent, track = state.agent, params.track
     points = track.walls_in_view.near(agent.position)
-    scan = sensing.lidar(points, agent.position, agent.heading, params.edges, tracks.VIEW)
+    scan = sensing.lidar(points, agent.position, agent.heading, LIDAR_BINS, tracks.VIEW)
     bend = angle_of(to_ego(track.onward[state.index], agent.heading))
     return jnp.concatenate([scan, agent.position, jnp.stack([bend, agent.speed])])
 

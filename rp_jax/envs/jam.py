@@ -72,7 +72,6 @@ class Params(struct.PyTreeNode):
     walls_in_view: sensing.PointGrid
     walls_in_contact: sensing.PointGrid
     walls_in_reach: sensing.PointGrid
-    edges: Array  # (361, 2) directions of the LIDAR bins' edges
     time_limit: Array  # () int32, steps
     stop_speed: Array  # () slower than this costs .05
     radius: Array  # () of every vehicle
@@ -165,7 +164,6 @@ def make_params(
         walls_in_view=sensing.points_within(walls, 1.0, 0.2),
         walls_in_contact=sensing.points_within(walls, radius, 0.1),
         walls_in_reach=sensing.points_within(walls, float(np.hypot(*corner)), 0.2),
-        edges=sensing.bin_edges(LIDAR_BINS),
         time_limit=jnp.asarray(time_limit, jnp.int32),
         stop_speed=jnp.asarray(0.005, float),
         radius=jnp.asarray(radius, float),
@@ -337,7 +335,7 @@ def observe(state: State, params: Params) -> Array:
     """(396,) LIDAR of the walls (360), 8 nearest obstacles (32), x, y, heading angle, speed."""
     agent = state.agent
     points = params.walls_in_view.near(agent.position)
-    scan = sensing.lidar(points, agent.position, agent.heading, params.edges)
+    scan = sensing.lidar(points, agent.position, agent.heading, LIDAR_BINS)
     pose = jnp.stack([angle_of(agent.heading), agent.speed])
     return jnp.concatenate([scan, _seen_obstacles(state).reshape(-1), agent.position, pose])
 

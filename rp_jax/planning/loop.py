@@ -65,6 +65,11 @@ class LoopConfig:
         return -(-self.steps // self.num_envs)
 
     @property
+    def filling(self) -> int:
+        """Iterations before learning begins: they fill the windows, then the replay."""
+        return self.n_step - 1 + -(-self.replay_start // self.num_envs)
+
+    @property
     def samples_per_step(self) -> float:
         """Replayed transitions per agent step."""
         return self.batch * self.updates / self.num_envs
@@ -106,7 +111,7 @@ class LoopState(NamedTuple):
     learner: Learner
     replay: Any
     key: Array
-    iteration: Array  # ()
+    iteration: Array  # () int32; below 0 the windows are not full yet
 
 
 def make_network(config: LoopConfig, pmdp: PMDP) -> nn.Module:
@@ -137,7 +142,7 @@ def make_replay(config: LoopConfig) -> Any:
 def exploration(iteration: Array, config: LoopConfig) -> Array:
     """() epsilon, falling linearly."""
     span = max(1.0, config.explore_share * config.iterations)
-    done = jnp.minimum(iteration / span, 1.0)
+    done = jnp.clip(iteration / span, 0.0, 1.0)
     return config.explore_from + done * (config.explore_to - config.explore_from)
 
 
@@ -221,15 +226,15 @@ def _inadmissible(threat: Array, action: Array, x: Array) -> Array:
     return ~((taken <= x) | ((least > x) & (taken <= least)))
 
 
-def init(key: Array, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics]:
-    """Starts all environments and a learner, and fills the replay up to `replay_start`.
+def begin(key: Array, pmdp: PMDP, config: LoopConfig) -> LoopState:
+    """All environments at a start, a fresh learner, and nothing in the replay.
 
     Raises:
         ValueError: a setting is out of range.
     """
     config.validate("config")
     random_key("key", key)
-    reset_key, net_key, warm_key, key = jax.random.split(key, 4)
+    reset_key, net_key, key = jax.random.split(key, 3)
     batch = config.num_envs
     network, replay = make_network(config, pmdp), make_replay(config)
     resets = jax.random.split(reset_key, batch)
@@ -241,7 +246,7 @@ def init(key: Array, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics
     taken = Taken(encoded, jnp.zeros(batch, jnp.int32), zeros, false, false, encoded, bits)
     window = jax.tree.map(lambda a: jnp.stack([a] * config.n_step), taken)
     example = _oldest(window, config)
-    state = LoopState(
+    return LoopState(
         states=states,
         seen=seen,
         score=zeros,
@@ -250,24 +255,13 @@ def init(key: Array, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics
         learner=dqn.init(net_key, network, make_optimiser(config), encoded),
         replay=replay.init(jax.tree.map(lambda a: a[0], example)),
         key=key,
-        iteration=jnp.asarray(0, jnp.int32),
+        iteration=jnp.asarray(1 - config.n_step, jnp.int32),
     )
 
-    def warm(state: LoopState, key: Array):
-        state, metrics = interact(key, state, pmdp, network, config)
-        return state, (metrics, _oldest(state.window, config))
 
-    # Real steps fill the window and then the replay, before anything is learned.
-    fill = -(-config.replay_start // batch)
-    warm_keys = jax.random.split(warm_key, config.n_step - 1 + fill)
-    state, (metrics, items) = jax.lax.scan(warm, state, warm_keys)
-    items = jax.tree.map(
-        lambda a: a[config.n_step - 1 :].reshape(fill * batch, *a.shape[2:]), items
-    )
-    state = state._replace(
-        replay=replay.add(state.replay, items), iteration=jnp.asarray(fill, jnp.int32)
-    )
-    return state, jax.tree.map(lambda m: jnp.sum(m, axis=0), metrics)
+def init(key: Array, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics]:
+    """`begin`, and a replay filled up to `replay_start` by real steps."""
+    return chunk(begin(key, pmdp, config), pmdp, config, config.filling, updates=0)
 
 
 def _oldest(window: Taken, config: LoopConfig) -> Transition:
@@ -275,14 +269,26 @@ def _oldest(window: Taken, config: LoopConfig) -> Transition:
     return jax.vmap(n_step_transition, (1, None))(window, config.learner.gamma)
 
 
+def _store(state: LoopState, config: LoopConfig) -> Any:
+    """The replay with the windows' oldest steps; while windows fill, the next ones replace them."""
+    old = state.replay
+    new = make_replay(config).add(old, _oldest(state.window, config))
+    if config.n_step == 1:
+        return new
+    filling = state.iteration < 0
+    return new.replace(
+        current_index=jnp.where(filling, old.current_index, new.current_index),
+        is_full=jnp.where(filling, old.is_full, new.is_full),
+    )
+
+
 def collect(state: LoopState, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics]:
     """Act, step, look, store: one step of every environment."""
-    network, replay = make_network(config, pmdp), make_replay(config)
     key, act_key = jax.random.split(state.key)
+    network = make_network(config, pmdp)
     state, metrics = interact(act_key, state, pmdp, network, config)
-    stored = replay.add(state.replay, _oldest(state.window, config))
-    state = state._replace(replay=stored, key=key, iteration=state.iteration + 1)
-    return state, metrics
+    stored = _store(state, config)
+    return state._replace(replay=stored, key=key, iteration=state.iteration + 1), metrics
 
 
 def learn(key: Array, state: LoopState, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Array]:
@@ -306,22 +312,36 @@ def learn(key: Array, state: LoopState, pmdp: PMDP, config: LoopConfig) -> tuple
 
 
 def chunk(
-    state: LoopState, pmdp: PMDP, config: LoopConfig, iterations: int
+    state: LoopState,
+    pmdp: PMDP,
+    config: LoopConfig,
+    iterations: int | Array,
+    updates: int | Array | None = None,
 ) -> tuple[LoopState, Metrics]:
-    """`iterations` of: collect, then learn `config.updates` times. Metrics are summed."""
-    number("iterations", iterations, least=1, integer=True)
+    """`iterations` of: collect, then learn `updates` times. Metrics are summed.
 
-    def iteration(state: LoopState, _) -> tuple[LoopState, Metrics]:
+    None stands for `config.updates`; it may be fewer. Where both numbers are traced, one compiled
+    program fills the replay (0 updates) and learns.
+    """
+    if isinstance(iterations, int):
+        number("iterations", iterations, least=1, integer=True)
+    updates = config.updates if updates is None else updates
+
+    def iteration(_, carry: tuple[LoopState, Metrics]) -> tuple[LoopState, Metrics]:
+        state, sums = carry
         state, metrics = collect(state, pmdp, config)
-        key, *keys = jax.random.split(state.key, 1 + config.updates)
-        state = state._replace(key=key)
-        for learn_key in keys:
-            state, loss = learn(learn_key, state, pmdp, config)
-            metrics = metrics._replace(loss=metrics.loss + loss)
-        return state, metrics
+        keys = jax.random.split(state.key, 1 + config.updates)
 
-    state, metrics = jax.lax.scan(iteration, state, None, length=iterations)
-    return state, jax.tree.map(lambda m: jnp.sum(m, axis=0), metrics)
+        def update(i: Array, carry: tuple[LoopState, Array]) -> tuple[LoopState, Array]:
+            state, loss = learn(keys[1 + i], carry[0], pmdp, config)
+            return state, carry[1] + loss
+
+        start = state._replace(key=keys[0]), metrics.loss
+        state, loss = jax.lax.fori_loop(0, updates, update, start)
+        return state, jax.tree.map(jnp.add, sums, metrics._replace(loss=loss))
+
+    nothing = Metrics(*[jnp.zeros((), state.score.dtype)] * len(Metrics._fields))
+    return jax.lax.fori_loop(0, iterations, iteration, (state, nothing))
 
 
 def check(params: Any, metrics: Metrics) -> None:

@@ -1,6 +1,5 @@
 import dataclasses
 import functools
-import types
 
 import jax
 import jax.numpy as jnp
@@ -209,6 +208,24 @@ def test_penalties_and_seeds_learn_as_one_program_what_each_learns_alone(compile
     assert (metrics.loss[0] != metrics.loss[1]).any()  # where someone fell
 
 
+def test_one_program_fills_the_replay_and_then_learns(compile_soon):
+    pmdp = probe.make_pmdp(probe, PARAMS)
+    program = jax.jit(functools.partial(loop.chunk, pmdp=pmdp, config=CONFIG))
+    begun = jax.jit(loop.begin, static_argnums=2)(jax.random.key(4), pmdp, CONFIG)
+    assert (begun.iteration, begun.replay.current_index) == (-1, 0)
+    early, _ = program(begun, iterations=1, updates=0)  # the windows hold two steps
+    assert (early.iteration, early.replay.current_index) == (0, 0)
+    state, metrics = program(begun, iterations=CONFIG.filling, updates=0)
+    assert (state.iteration, state.replay.current_index) == (10, 320)
+    assert (metrics.steps, metrics.loss) == (11 * 32, 0)
+    assert state.learner.updates == 0
+    assert alike(state.learner.params, begun.learner.params)
+    state, metrics = program(state, iterations=3, updates=1)
+    assert (state.iteration, state.learner.updates, metrics.steps) == (13, 3, 96)
+    assert metrics.loss > 0
+    assert program._cache_size() == 1
+
+
 def test_a_chunk_is_compiled_once_whatever_the_values():
     learned("RP")
     before = len(TRACED)
@@ -236,10 +253,8 @@ def test_no_key_is_used_twice(monkeypatch):
         note(key)
         return state, 0.0
 
-    nothing = types.SimpleNamespace(add=lambda old, new: old)
     monkeypatch.setattr(loop, "make_network", lambda *_: None)
-    monkeypatch.setattr(loop, "make_replay", lambda *_: nothing)
-    monkeypatch.setattr(loop, "_oldest", lambda *_: None)
+    monkeypatch.setattr(loop, "_store", lambda state, _: state.replay)
     monkeypatch.setattr(loop, "interact", act)
     monkeypatch.setattr(loop, "learn", learn)
     blank = dict.fromkeys(loop.LoopState._fields, jnp.zeros(()))
