@@ -4,6 +4,7 @@ RP, penalised DQN (several penalties in one program), CPO, PID-Lagrangian PPO, a
 learns nothing. Counts the crashes while learning as well as those after it.
 
 python -m experiments.compare --env jam
+python -m experiments.compare --env jam --methods DQN --steps 12000000   # ten times as many
 """
 
 import dataclasses
@@ -25,10 +26,11 @@ from rp_jax.validate import number, one_of
 
 # Penalties of DQN, c, and steps that MPC looks ahead; section 5 and appendix G.
 SETTINGS: dict[str, tuple[tuple[float, ...], float, int]] = {
-    "circuit": ((0.0, 20.0, 200.0), 1e-3, 3),
+    "circuit": ((0.0, 20.0, 200.0), 1e-3, 4),
     "jam": ((5.0, 50.0, 500.0), 1e-2, 3),
     "point_gather": ((1.0, 10.0, 50.0), 0.1, 2),
 }
+FIRST_PENALTY = {"jam": 5.0}  # from which that of DQN rises, appendix G.2
 METHODS = ("RP", "DQN", "CPO", "PID", "MPC")
 
 
@@ -146,7 +148,9 @@ def run(
         at = checkpoints.at("rp")
         add(by_q_learning(task, settings, models, members, folder / "rp", at))
     if "DQN" in config.methods:
-        plain = dataclasses.replace(settings, x=float("inf"))
+        plain = dataclasses.replace(
+            settings, x=float("inf"), learning_penalty_from=FIRST_PENALTY.get(config.env)
+        )
         each = pipeline.members_of(plain)
         members = [m._replace(learning_penalty=p) for p in penalties for m in each]
         at = checkpoints.at("dqn")
@@ -179,6 +183,7 @@ def show(rows: Sequence[dict[str, Any]]) -> None:
                     "return": f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}",
                     "crashes": f"{row['crashes']:,} of {row['episodes']:,}",
                     "% [95 %]": tables.percent(row),
+                    "steps": f"{row['training_steps']:,}" if row["training_steps"] else "-",
                     "crashes while learning": learned if row["training_steps"] else "-",
                     "learning, s": f"{row['train_seconds']:.1f}",
                     "ms an action": f"{10 * row['seconds_per_100_actions']:.2f}",

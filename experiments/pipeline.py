@@ -45,6 +45,7 @@ class Config:
     threat: Path | None = None  # folder of a threat function to use again
     x: float = 0.01  # largest admissible threat; inf switches the shield off
     learning_penalty: float = 0.0  # taken off the reward per unit of danger while learning
+    learning_penalty_from: float | None = None  # at first; it gets there by half-way
     learning_toll: float = 0.0  # likewise, per state without an admissible action
     penalty: float = 50.0  # taken off the return per unit of danger in the tables
     episodes: int = 10_000  # evaluated per case
@@ -60,6 +61,8 @@ class Config:
         number("seed", self.seed, least=0, most=2**31 - 1001, integer=True)
         number("x", self.x, least=0, infinite=True)
         number("learning_penalty", self.learning_penalty, least=0)
+        if self.learning_penalty_from is not None:
+            number("learning_penalty_from", self.learning_penalty_from, least=0)
         number("learning_toll", self.learning_toll, least=0)
         number("penalty", self.penalty, least=0)
         number("episodes", self.episodes, least=1, integer=True)
@@ -233,6 +236,14 @@ def method_name(config: Config, member: Member | None = None) -> str:
     return name if penalty == 0 else f"{name[:-1]}, {penalty:g})"
 
 
+def during(pmdp: PMDP, share: float, config: Config) -> PMDP:
+    """`pmdp` with the penalty of the moment when a share of the run is over (appendix G.2)."""
+    begin = config.learning_penalty_from
+    if begin is None:
+        return pmdp
+    return pmdp.replace(penalty=begin + min(1.0, 2 * share) * (pmdp.penalty - begin))
+
+
 class Record(NamedTuple):
     """What happened in each chunk of a training run."""
 
@@ -292,7 +303,7 @@ def plan(
         def advance(i: int, carried: tuple[loop.LoopState, Record]):
             nonlocal now
             state, record = carried
-            state, new = step(state, pmdp)
+            state, new = step(state, during(pmdp, i / chunks, config))
             for whole, part in zip(record.metrics, devices.gather(new, mesh), strict=True):
                 whole[i] += part
             params = devices.gather(state.learner.params, mesh)
@@ -304,7 +315,7 @@ def plan(
             bar("", i + 1, chunks, note(rows[-len(members) :]))
             return state, record
 
-        state, metrics = start(keys, pmdp)
+        state, metrics = start(keys, during(pmdp, 0.0, config))
         metrics = devices.gather(metrics, mesh)
         blank = jax.tree.map(lambda m: np.zeros((chunks, *m.shape), m.dtype), metrics)
         for whole, part in zip(blank, metrics, strict=True):
