@@ -154,7 +154,7 @@ def gae(
     discount: Array,
     trace: float,
 ) -> Array:
-    """(T,) generalised advantages (Schulman et al. 2016, equation 16) of one environment.
+    """(T,) generalised advantages (GAE, Schulman et al. 2016) of one environment.
 
     A true end is worth 0; a time limit, and the batch's last step, the value of the state reached.
 
