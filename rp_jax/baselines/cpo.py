@@ -61,9 +61,7 @@ def fisher_product(
 ) -> Callable[[Array], Array]:
     """The product of the Fisher matrix at `theta` (P,), damped, with a vector (P,).
 
-    The matrix is the Hessian of the mean KL divergence from the policy at `theta`. A product is
-    taken anew from the divergence: with a linearisation kept outside, the conjugate gradients of
-    a compiled update came out as nan on Jam.
+    The matrix is the Hessian of the mean KL divergence from the policy at `theta`.
 
     Args:
         policy: distributions of a batch of states, for weights (P,).
