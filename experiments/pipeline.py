@@ -45,6 +45,7 @@ class Config:
     threat: Path | None = None  # folder of a threat function to use again
     x: float = 0.01  # largest admissible threat; inf switches the shield off
     learning_penalty: float = 0.0  # taken off the reward per unit of danger while learning
+    learning_penalty_from: float | None = None  # at first; it gets there by half-way
     learning_toll: float = 0.0  # likewise, per state without an admissible action
     penalty: float = 50.0  # taken off the return per unit of danger in the tables
     episodes: int = 10_000  # evaluated per case
@@ -61,6 +62,8 @@ class Config:
         number("seed", self.seed, least=0, most=2**31 - 1001, integer=True)
         number("x", self.x, least=0, infinite=True)
         number("learning_penalty", self.learning_penalty, least=0)
+        if self.learning_penalty_from is not None:
+            number("learning_penalty_from", self.learning_penalty_from, least=0)
         number("learning_toll", self.learning_toll, least=0)
         number("penalty", self.penalty, least=0)
         number("episodes", self.episodes, least=1, integer=True)
@@ -236,10 +239,18 @@ def method_name(config: Config, member: Member | None = None) -> str:
     return name if penalty == 0 else f"{name[:-1]}, {penalty:g})"
 
 
+def during(pmdp: PMDP, share: float, config: Config) -> PMDP:
+    """`pmdp` with the penalty of the moment when a share of the run is over (appendix G.2)."""
+    begin = config.learning_penalty_from
+    if begin is None:
+        return pmdp
+    return pmdp.replace(penalty=begin + min(1.0, 2 * share) * (pmdp.penalty - begin))
+
+
 class Record(NamedTuple):
     """What happened in each chunk of a training run."""
 
-    metrics: loop.Metrics  # (chunks, members)
+    metrics: Any  # (chunks, members) sums, those of `planning.loop` or of an on-policy learner
     seconds: np.ndarray  # (chunks,) since the beginning, interruptions left out
 
 
@@ -262,7 +273,8 @@ def plan(
     chunks = -(-max(1, planning.iterations - warm) // length)
     steps = (warm + chunks * length) * planning.num_envs
     keys = keys_of(members, PLANNING)
-    methods = list(dict.fromkeys(method_name(config, member) for member in members))
+    names = [method_name(config, member) for member in members]
+    methods = list(dict.fromkeys(names))
     console.say(
         f"planning: {len(members)} x {steps:,} steps, {planning.samples_per_step:g} samples "
         f"replayed per step, {'; '.join(methods)}"
@@ -272,7 +284,12 @@ def plan(
     keys, pmdp = devices.place((keys, pmdp), (0, axes), mesh)
 
     def history(record: Record, done: int) -> list[dict[str, Any]]:
-        return _history(record, done, config, members, length * planning.updates)
+        rows = history_of(record, done, members, names, config.penalty)
+        for row, of in zip(rows, _each(record.metrics, done), strict=True):
+            row["insecure"] = of["insecure"] / of["steps"]
+            row["inadmissible"] = int(of["inadmissible"])
+            row["loss"] = of["loss"] / (length * planning.updates)
+        return rows
 
     with console.progress("planning") as bar:
         bar("", 0, chunks, "compiling")
@@ -293,7 +310,7 @@ def plan(
         def advance(i: int, carried: tuple[loop.LoopState, Record]):
             nonlocal now
             state, record = carried
-            state, new = step(state, pmdp, length, planning.updates)
+            state, new = step(state, during(pmdp, i / chunks, config), length, planning.updates)
             for whole, part in zip(record.metrics, devices.gather(new, mesh), strict=True):
                 whole[i] += part
             params = devices.gather(state.learner.params, mesh)
@@ -301,11 +318,11 @@ def plan(
             now, before = time.perf_counter(), now
             record.seconds[i] = record.seconds[i - 1] + now - before
             rows = history(record, i + 1)
-            _write_lines(folder / "metrics.jsonl", rows)
-            bar("", i + 1, chunks, _note(rows[-len(members) :]))
+            write_lines(folder / "metrics.jsonl", rows)
+            bar("", i + 1, chunks, note(rows[-len(members) :]))
             return state, record
 
-        state, metrics = step(first(keys, pmdp), pmdp, planning.filling, 0)
+        state, metrics = step(first(keys, pmdp), during(pmdp, 0.0, config), planning.filling, 0)
         metrics = devices.gather(metrics, mesh)
         blank = jax.tree.map(lambda m: np.zeros((chunks, *m.shape), m.dtype), metrics)
         for whole, part in zip(blank, metrics, strict=True):
@@ -321,47 +338,61 @@ def plan(
     about = {"methods": methods, "members": [member._asdict() for member in members]}
     storage.save(folder / "agent", "Q-network", params, about)
     rows = history(record, chunks)
-    _write_lines(folder / "metrics.jsonl", rows)
+    write_lines(folder / "metrics.jsonl", rows)
     return Trained(params, rows, float(record.seconds[-1]), compiled - began)
 
 
-def _history(
-    record: Record, done: int, config: Config, members: Sequence[Member], updates: int
+def history_of(
+    record: Record, done: int, members: Sequence[Member], names: Sequence[str], penalty: float
 ) -> list[dict[str, Any]]:
-    """One row per chunk and member."""
+    """One row per chunk and member, of what all learners count.
+
+    Args:
+        record: of the run.
+        done: chunks that are over.
+        members: what learns side by side.
+        names: of their methods.
+        penalty: taken off the return per unit of danger.
+    """
     rows = []
     steps = np.cumsum(record.metrics.steps.astype(int), axis=0)
-    for chunk in range(done):
-        for i, member in enumerate(members):
-            of = {name: float(m[chunk, i]) for name, m in record.metrics._asdict().items()}
-            ended = max(of["episodes"], 1.0)
-            rows.append(
-                {
-                    "seed": member.seed,
-                    "method": method_name(config, member),
-                    "steps": int(steps[chunk, i]),
-                    "episodes": int(of["episodes"]),
-                    "return_mean": (of["score"] - config.penalty * of["danger"]) / ended
-                    if of["episodes"]
-                    else float("nan"),
-                    "crashes": int(of["crashes"]),
-                    "goal_rate": of["goals"] / ended,
-                    "insecure": of["insecure"] / of["steps"],
-                    "inadmissible": int(of["inadmissible"]),
-                    "loss": of["loss"] / updates,
-                    "seconds": float(record.seconds[chunk]),
-                }
-            )
+    for k, of in enumerate(_each(record.metrics, done)):
+        chunk, i = divmod(k, len(members))
+        ended = max(of["episodes"], 1.0)
+        rows.append(
+            {
+                "seed": members[i].seed,
+                "method": names[i],
+                "steps": int(steps[chunk, i]),
+                "episodes": int(of["episodes"]),
+                "return_mean": (of["score"] - penalty * of["danger"]) / ended
+                if of["episodes"]
+                else float("nan"),
+                "crashes": int(of["crashes"]),
+                "goal_rate": of["goals"] / ended,
+                "seconds": float(record.seconds[chunk]),
+            }
+        )
     return rows
 
 
-def _note(rows: Sequence[Mapping]) -> str:
+def _each(metrics: Any, done: int) -> list[dict[str, float]]:
+    """The sums of each chunk and member, in the order of rows."""
+    return [
+        {name: float(m[chunk, i]) for name, m in metrics._asdict().items()}
+        for chunk in range(done)
+        for i in range(metrics.steps.shape[1])
+    ]
+
+
+def note(rows: Sequence[Mapping]) -> str:
+    """Return and crashes of the last chunk, for the progress bar."""
     returns = np.mean([row["return_mean"] for row in rows])
     crashes, ended = sum(r["crashes"] for r in rows), sum(r["episodes"] for r in rows)
     return f"return {returns:.1f}, {crashes} crashes in {ended} episodes"
 
 
-def _write_lines(path: Path, rows: Sequence[Mapping]) -> None:
+def write_lines(path: Path, rows: Sequence[Mapping]) -> None:
     """The whole file each time: no line of it is ever half there, or there twice."""
     plain = [{k: None if v != v else v for k, v in row.items()} for row in rows]
     storage.write_bytes(path, "".join(json.dumps(row) + "\n" for row in plain).encode())

@@ -39,7 +39,10 @@ class PointGrid(struct.PyTreeNode):
         """Index of the point nearest to `position` (2,); the first of equals."""
         i, j = self._cell_of(position)
         squared = squared_distance(self.points[i, j], position[None])
-        return self.index[i, j, jnp.argmin(squared)]
+        # An argmin in two minima, which vectorise: the padding of a row, at its end, has index -1.
+        last = jnp.iinfo(self.index.dtype).max
+        row = jnp.where(self.index[i, j] < 0, last, self.index[i, j])
+        return jnp.min(jnp.where(squared > jnp.min(squared), last, row))
 
 
 def _cells(points: np.ndarray, cell: float, margin: float):

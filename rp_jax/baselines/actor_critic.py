@@ -63,6 +63,7 @@ class State(NamedTuple):
 
     states: Any  # (B,) environment states
     score: Array  # (B,) reward of the running episodes
+    danger: Array  # (B,) likewise
     actor: Any
     critic: Any
     critic_opt: optax.OptState
@@ -84,7 +85,8 @@ class Metrics(NamedTuple):
     steps: Array
     episodes: Array
     score: Array  # of the finished episodes
-    danger: Array
+    danger: Array  # likewise
+    crashes: Array  # finished episodes with any danger
     goals: Array
 
 
@@ -131,9 +133,11 @@ def init(key: Array, pmdp: PMDP, config: ActorCriticConfig) -> State:
     states = jax.vmap(pmdp.env.reset, (0, None))(resets, pmdp.params)
     encoded = pmdp.perceive(states).encoded
     critic = make_critic(pmdp).init(critic_key, encoded)
+    nothing = jnp.zeros(config.num_envs, pmdp.x.dtype)
     return State(
         states=states,
-        score=jnp.zeros(config.num_envs, pmdp.x.dtype),
+        score=nothing,
+        danger=nothing,
         actor=make_actor(pmdp, config).init(actor_key, encoded),
         critic=critic,
         critic_opt=optax.adam(config.critic_rate).init(critic),
@@ -150,7 +154,7 @@ def gae(
     discount: Array,
     trace: float,
 ) -> Array:
-    """(T,) generalised advantages (Schulman et al. 2016, equation 16) of one environment.
+    """(T,) generalised advantages (GAE, Schulman et al. 2016) of one environment.
 
     A true end is worth 0; a time limit, and the batch's last step, the value of the state reached.
 
@@ -202,7 +206,7 @@ def collect(
         return encoded, jnp.asarray(critic.apply(state.critic, encoded))
 
     def one(carry, key):
-        states, (encoded, value), score = carry
+        states, (encoded, value), score, danger = carry
         act_key, step_key = jax.random.split(key)
         policy: Any = actor.apply(state.actor, encoded)
         action = policy.sample(act_key)
@@ -212,24 +216,26 @@ def collect(
         )
         signal = jnp.stack([config.reward_scale * outcome.reward, outcome.danger], axis=-1)
         step = _Step(encoded, action, signal, value, next_value, outcome.terminated, outcome.done)
-        score = score + outcome.reward
+        score, danger = score + outcome.reward, danger + outcome.danger
         metrics = Metrics(
             steps=jnp.asarray(config.num_envs, score.dtype),
             episodes=jnp.sum(outcome.done, dtype=score.dtype),
             score=jnp.sum(jnp.where(outcome.done, score, 0.0)),
-            danger=jnp.sum(outcome.danger),
+            danger=jnp.sum(jnp.where(outcome.done, danger, 0.0)),
+            crashes=jnp.sum(outcome.done & (danger > 0), dtype=score.dtype),
             goals=jnp.sum(outcome.goal, dtype=score.dtype),
         )
-        return (*carried, jnp.where(outcome.done, 0.0, score)), (step, metrics)
+        running = [jnp.where(outcome.done, 0.0, total) for total in (score, danger)]
+        return (*carried, *running), (step, metrics)
 
-    begin = (state.states, look(state.states), state.score)
+    begin = (state.states, look(state.states), state.score, state.danger)
     keys = jax.random.split(key, config.length)
-    (states, _, score), (steps, metrics) = jax.lax.scan(one, begin, keys)
+    (states, _, score, danger), (steps, metrics) = jax.lax.scan(one, begin, keys)
     advantage = _advantages(steps, config)
     batch = Batch(steps.encoded, steps.action, advantage, advantage + steps.value)
     batch = jax.tree.map(lambda a: a.reshape(config.steps, *a.shape[2:]), batch)
     metrics = jax.tree.map(lambda m: jnp.sum(m, axis=0), metrics)
-    return state._replace(states=states, score=score), batch, metrics
+    return state._replace(states=states, score=score, danger=danger), batch, metrics
 
 
 def update_critic(state: State, batch: Batch, pmdp: PMDP, config: ActorCriticConfig) -> State:

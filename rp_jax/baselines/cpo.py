@@ -124,7 +124,7 @@ def step_lengths(
 def improve(
     params: Any, network: nn.Module, batch: Batch, excess: Array, config: CPOConfig
 ) -> tuple[Any, Update]:
-    """One update of the policy (Algorithm 1).
+    """One update of the policy (their Algorithm 1).
 
     Args:
         params: of the policy.

@@ -72,7 +72,7 @@ def control(
 def objective(
     params: Any, network: nn.Module, batch: Batch, gain: Array, before: Array, clip: float
 ) -> Array:
-    """() the clipped surrogate (Schulman et al. 2017, equation 7), to be maximised.
+    """() the clipped surrogate of PPO (Schulman et al. 2017), to be maximised.
 
     Args:
         params: of the policy.

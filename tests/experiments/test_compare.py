@@ -41,7 +41,20 @@ def test_every_method_has_its_rows(finished, tmp_path, monkeypatch, capsys):
             assert row["crash_ci95"][0] <= row["crash_rate"] <= row["crash_ci95"][1]
             assert row["seconds_per_100_actions"] > 0
             assert (row["training_steps"] >= 6000) == ("MPC" not in method)
-            assert row["training_danger"] <= row["training_episodes"]
+            assert row["training_crashes"] <= row["training_episodes"]
+    for name, method in {"cpo": "CPO", "pid": "PID-Lagrangian"}.items():
+        text = (out / name / "metrics.jsonl").read_text()
+        history = [json.loads(line) for line in text.splitlines()]
+        dqn = json.loads((out / "dqn" / "metrics.jsonl").read_text().splitlines()[0])
+        assert set(history[0]) == set(dqn) - {"insecure", "inadmissible", "loss"}
+        steps = [line["steps"] for line in history]
+        assert steps == sorted(set(steps))
+        (mine,) = {
+            tuple(r[f"training_{k}"] for k in ("steps", "episodes", "crashes"))
+            for r in rows
+            if r["method"] == method
+        }
+        assert mine == (steps[-1], *(sum(h[k] for h in history) for k in ("episodes", "crashes")))
     shown = capsys.readouterr().out
     for variant in {row["variant"] for row in rows}:
         assert f"circuit {variant}" in shown

@@ -3,6 +3,7 @@ import json
 import re
 import subprocess
 import sys
+import types
 
 import jax
 import numpy as np
@@ -171,6 +172,7 @@ def test_without_a_shield_no_threat_is_learned(tmp_path):
         ("x", (-0.1, float("nan"))),
         ("penalty", (-1.0, float("inf"))),
         ("learning_penalty", (-1.0, float("nan"))),
+        ("learning_penalty_from", (-1.0, float("inf"))),
         ("learning_toll", (-1.0, float("inf"))),
         ("baseline", ("brave", "")),
         ("episodes", (0, -10, 2.5)),
@@ -184,6 +186,17 @@ def test_settings_out_of_range_are_named(field, values):
     for value in values:
         with pytest.raises(ValueError, match=rf"^{field}.* is .*; it must be"):
             circuit.Config(**{field: value}).validate()
+
+
+def test_a_penalty_rises_from_its_first_value_and_is_there_half_way():
+    pmdp = types.SimpleNamespace(penalty=np.asarray([5.0, 50.0]))
+    pmdp.replace = lambda penalty: types.SimpleNamespace(penalty=penalty)
+    assert pipeline.during(pmdp, 0.3, circuit.Config()) is pmdp
+    rising = circuit.Config(learning_penalty_from=5.0)
+    expected = {0.0: 5.0, 0.25: 27.5, 0.5: 50.0, 0.9: 50.0}
+    for share, penalty in expected.items():
+        found = pipeline.during(pmdp, share, rising).penalty
+        np.testing.assert_allclose(found, [5.0, penalty])
 
 
 def test_no_two_uses_of_seeds_share_a_key():
