@@ -43,6 +43,13 @@ class Episode(NamedTuple):
     hit: np.ndarray  # (t,) bool, danger was met on the way here
 
 
+class Path2D(NamedTuple):
+    """What `trajectories` draws of an episode."""
+
+    position: np.ndarray  # (t, 2)
+    hit: np.ndarray  # (t,) bool
+
+
 def draw_scene(axis: Any, scene: Scene) -> None:
     """Walls as dots, safety zones shaded, rings about their places."""
     low, high = scene.walls.min(axis=0), scene.walls.max(axis=0)
@@ -64,7 +71,9 @@ def draw_scene(axis: Any, scene: Scene) -> None:
     axis.set_yticks([])
 
 
-def trajectories(panels: Sequence[tuple[str, Scene, Sequence[Episode]]], path: Path) -> None:
+def trajectories(
+    panels: Sequence[tuple[str, Scene, Sequence[Episode | Path2D]]], path: Path
+) -> None:
     """Paths of several episodes per panel (figure 6); S marks the start, red crosses crashes."""
     columns = min(3, len(panels))
     lines = -(-len(panels) // columns)
