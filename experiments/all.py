@@ -44,7 +44,7 @@ from experiments.paper import (
 )
 from experiments.paper.commands import COMMANDS, SIZES
 from experiments.paper.scores import read
-from experiments.paper.sources import LOG, Failed, Sources
+from experiments.paper.sources import LOG, RunError, Sources
 from rp_jax import storage
 from rp_jax.validate import one_of
 
@@ -99,7 +99,7 @@ def make(names: Sequence[str], sources: Sources, folder: Path) -> dict[str, str]
                 result(RESULTS[name], sources, folder / name)
             else:
                 sources(name)
-        except Failed as error:
+        except RunError as error:
             failed[name] = str(error)
         except Exception as error:  # whatever it is, the others are not to suffer
             traceback.print_exc()

@@ -66,7 +66,7 @@ SIZES: dict[str, dict[str, str]] = {
     },
     "quick": {
         "frozen_lake": "--horizons 100 --no-program",
-        "instances": "5000",
+        "instances": "2000",
         "seeds": "--episodes 1000",
         "few": "--episodes 1000",
         "episodes": "--episodes 1000",

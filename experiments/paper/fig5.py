@@ -9,10 +9,11 @@ from experiments.paper import published, scores
 from experiments.paper.section import Claim, Section, Table, holds
 
 TITLE = "Figure 5: learning curves"
-TASKS: dict[str, tuple[tuple[str, ...], tuple[int, ...]]] = {  # runs of RP, steps of MPC
-    "point_gather": (("point_gather", "point_gather_x01"), (1, 2)),
-    "circuit": (("circuit",), (3, 4)),
-    "jam": (("jam",), (2, 3)),
+# The variant that is learned on, runs of RP, steps of MPC.
+TASKS: dict[str, tuple[str, tuple[str, ...], tuple[int, ...]]] = {
+    "point_gather": ("8 bombs", ("point_gather", "point_gather_x01"), (1, 2)),
+    "circuit": ("default", ("circuit",), (3, 4)),
+    "jam": ("N=8", ("jam",), (2, 3)),
 }
 LEARNERS = ("dqn", "cpo", "pid")  # folders inside a comparison
 KEPT = ("method", "seed", "steps", "episodes", "return_mean", "crashes")
@@ -21,20 +22,19 @@ KEPT = ("method", "seed", "steps", "episodes", "return_mean", "crashes")
 def run(sources: Any, folder: Path) -> dict[str, Any]:
     """By task, rows per chunk, method and seed; rows of MPC; what RP and others end with."""
     found: dict[str, Any] = {}
-    for env, (runs, searches) in TASKS.items():
+    for env, (variant, runs, searches) in TASKS.items():
         compared = sources(f"compare_{env}")
         files = [sources(name) / "metrics.jsonl" for name in runs]
         files += [compared / name / "metrics.jsonl" for name in LEARNERS]
         history = [row for file in files for row in scores.read_lines(file)]
         rows = [row for name in runs for row in scores.read(sources(name) / "table.json")]
         rows += scores.read(compared / "compare.json")
-        levels = [
-            scores.read(sources(f"mpc_{env}_{steps}") / "table.json")[0] for steps in searches
-        ]
+        files = [sources(f"mpc_{env}_{steps}") / "table.json" for steps in searches]
+        levels = [row for file in files for row in scores.read(file)]
         found[env] = {
             "history": [{key: row[key] for key in KEPT} for row in history],
-            "evaluated": [row for row in rows if row["variant"] == levels[0]["variant"]],
-            "levels": levels,
+            "evaluated": [row for row in rows if row["variant"] == variant],
+            "levels": [row for row in levels if row["variant"] == variant],
         }
     gather = sources("point_gather")
     shutil.copyfile(gather / "animation.gif", folder / "animation.gif")

@@ -17,7 +17,7 @@ LOG = "log.json"  # of a run's processes: command, commit, times, how each ended
 ONE_FILE = ("theorems",)  # experiments whose --out is a file
 
 
-class Failed(RuntimeError):
+class RunError(RuntimeError):
     """A run ended with an error."""
 
 
@@ -32,12 +32,12 @@ class Sources:
         """The folder of a finished run; makes or resumes the run, and those that it uses, first.
 
         Raises:
-            Failed: it ended with an error, now or earlier in this process.
+            RunError: it ended with an error, now or earlier in this process.
             KeyboardInterrupt: it was interrupted.
         """
         folder = self._folder / name
         if name in self._failed:
-            raise Failed(self._failed[name])
+            raise RunError(self._failed[name])
         if not finished(folder):
             self._make(name, folder)
         return folder
@@ -65,7 +65,7 @@ class Sources:
             raise KeyboardInterrupt(name)
         if ended["exit"] != 0:
             self._failed[name] = f"{entry['command']}: exit status {ended['exit']}"
-            raise Failed(self._failed[name])
+            raise RunError(self._failed[name])
 
 
 def finished(folder: Path) -> bool:

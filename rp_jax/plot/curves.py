@@ -80,27 +80,28 @@ def methods(
         path: of the PNG.
         levels: by title, rows of what does not learn: method, return_mean, crash_rate; dashed.
     """
-    names = dict.fromkeys(row["method"] for history in panels.values() for row in history)
-    colours = dict(zip(names, METHOD_COLOURS, strict=False))
+    most = max(len({row["method"] for row in history}) for history in panels.values())
+    below = 0.12 + 0.06 * (most // 2 + 2)  # for the legend
     figure, axes = plt.subplots(
         3,
         len(panels),
         figsize=(max(7, 4.6 * len(panels)), 6.6),
-        height_ratios=(1, 1, 0.12 + 0.06 * (len(names) // len(panels) + 2)),
+        height_ratios=(1, 1, below),
         sharex="col",
         layout="constrained",
         squeeze=False,
     )
     for column, (title, history) in zip(axes.T, panels.items(), strict=True):
+        colours = {True: iter(OURS), False: iter(OTHERS)}
         for name in dict.fromkeys(row["method"] for row in history):
             of = [row for row in history if row["method"] == name and row["episodes"]]
-            _line(column, of, colours[name], name)
+            _line(column, of, next(colours[name.startswith("RP")], "black"), name)
         for row, dashes in zip((levels or {}).get(title, ()), ("--", ":", "-."), strict=False):
             style = {"color": "black", "linestyle": dashes, "linewidth": 1}
             column[0].axhline(row["return_mean"], label=row["method"], **style)
             column[1].axhline(100 * row["crash_rate"], **style)
         column[0].set_title(title)
-        column[1].set_ylim(bottom=0)
+        _percent(column[1], "y")
         column[1].set_xlabel("agent steps")
         column[1].tick_params(labelbottom=True)
         for axis in column[:2]:
@@ -114,7 +115,16 @@ def methods(
     plt.close(figure)
 
 
-METHOD_COLOURS = (BLUE, RED, "#dd6b20", "#d69e2e", "#2f855a", "#805ad5", "#d53f8c", "#4fd1c5", GREY)
+OURS = (BLUE, "#63b3ed")
+OTHERS = (RED, "#dd6b20", "#d69e2e", "#2f855a", "#805ad5", "#d53f8c", GREY)
+
+
+def _percent(axis: Any, which: str) -> None:
+    """Crash rates from none to all on one scale; `which` is "x" or "y"."""
+    getattr(axis, f"set_{which}scale")("symlog", linthresh=0.01)
+    getattr(axis, f"set_{which}lim")(-0.001, 130)
+    ticks, names = [0, 0.01, 0.1, 1, 10, 100], ["0", ".01", ".1", "1", "10", "100"]
+    getattr(axis, f"set_{which}ticks")(ticks, names)
 
 
 def _line(axes: Any, rows: Sequence[Mapping[str, Any]], colour: str, name: str) -> None:
@@ -181,9 +191,7 @@ def scores(
         left.set_yticks(range(len(methods), 0, -1), methods, fontsize=8)
         left.set_ylim(0.3, len(methods) + 0.7)
         left.set_title(variant, loc="left", fontsize=10)
-        right.set_xscale("symlog", linthresh=0.01)
-        right.set_xlim(-0.001, 130)
-        right.set_xticks([0, 0.01, 0.1, 1, 10, 100], ["0", ".01", ".1", "1", "10", "100"])
+        _percent(right, "x")
         for axis in (left, right):
             axis.grid(alpha=0.3)
     axes[-1, 0].set_xlabel("return (crash penalty included)")
