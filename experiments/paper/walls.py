@@ -22,7 +22,7 @@ from rp_jax.threat.total import total_threat
 TITLE = "Walls: summed or jointly"
 TASKS = ("circuit", "jam")
 STATES = 256
-BINS = (0.0, 1e-3, 1e-2, 1e-1, 0.999)  # of the joint threat
+BINS = (0.0, 1e-3, 1e-2, 1e-1, 1.0)  # of the joint threat
 
 
 class Walls(struct.PyTreeNode):
