@@ -110,22 +110,25 @@ def make(names: Sequence[str], sources: Sources, folder: Path) -> dict[str, str]
 
 
 def result(module: Any, sources: Sources, folder: Path) -> None:
-    """Makes one result, unless it is saved already; draws its figures."""
+    """Makes one result, unless it is saved already; draws its figures, and lets it tell."""
     saved = folder / "results.json"
     if not saved.exists():
         folder.mkdir(exist_ok=True)
         storage.write_json(saved, module.run(sources, folder))
     if hasattr(module, "plot"):
         module.plot(read(saved), folder)
+    for name in module.tell(read(saved)).figures:
+        if not (folder / name).exists():
+            raise FileNotFoundError(f"{folder / name}: it was not drawn")
 
 
 def blocks(folder: Path, preset: str, failed: dict[str, str]) -> list[report.Block]:
     """The report on all results that are saved in the folder."""
-    found = {name: folder / name / "results.json" for name in RESULTS}
+    found = {name: folder / name / "results.json" for name in RESULTS if name not in failed}
     told = {name: RESULTS[name].tell(read(p)) for name, p in found.items() if p.exists()}
     claims = [claim for section in told.values() for claim in section.claims]
     counts = Counter(claim.verdict.partition(" (")[0] for claim in claims)
-    missing = [name for name in RESULTS if name not in told]
+    missing = [name for name in RESULTS if name not in told and name not in failed]
     machine = settings.machine()
     versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
     out: list[report.Block] = [

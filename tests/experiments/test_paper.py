@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import itertools
 import json
 
 import numpy as np
@@ -160,7 +161,7 @@ def parsed(name, preset):
                 config.validate()
             return config
         module = importlib.import_module("experiments.jam")
-    given = dict(zip(rest, rest[1:], strict=False))
+    given = dict(itertools.pairwise(rest))
     base = module.PRESETS[given.get("--preset", "quick")](given.get("--recipe", "tuned"))
     for word in ("--preset", "--recipe"):
         if word in rest:
