@@ -179,8 +179,11 @@ def test_commands_are_understood(name, preset):
     for word in commands.words(name, preset):
         if word.startswith("@"):
             assert word[1:].partition("/")[0] in commands.COMMANDS
-    if preset == "full" and name in ("jam", "circuit", "point_gather", "compare_jam"):
+    if preset == "full" and name in ("jam", "circuit", "point_gather", "jam_plans"):
         assert (config.seeds, config.episodes) == (10, 10_000)
+    if preset == "full" and name.startswith("compare"):
+        of = parsed(name.removeprefix("compare_"), preset)
+        assert (config.seeds, config.steps) == (10, of.planning.steps)  # as many as RP has
 
 
 def test_one_switch_differs_from_the_first_table():
