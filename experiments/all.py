@@ -2,7 +2,8 @@
 
 Each result has a folder in --out, and so has each run that results are taken from, in --out/runs.
 What is finished is not done again: --resume DIR goes on where it was stopped, and with --only
-makes some results (or runs) alone. Two processes may not work in one folder.
+makes some results (or runs) alone. Several processes may work in one folder: a run is made by one
+of them, and what needs it fails in the others until it is finished.
 
 python -m experiments.all --preset quick
 """

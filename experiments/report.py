@@ -42,7 +42,7 @@ STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1a202c; max-width: 1100px; margin: 2em auto;
   padding: 0 1em; }
 h1, h2 { line-height: 1.2; } h2 { margin-top: 2.5em; border-bottom: 1px solid #cbd5e0; }
-.scroll { overflow-x: auto; } table { border-collapse: collapse; font-size: 13px; }
+.scroll { overflow-x: auto; margin: 1em 0; } table { border-collapse: collapse; font-size: 13px; }
 caption { text-align: left; font-weight: 600; padding: .4em 0; white-space: nowrap; }
 th, td { border-bottom: 1px solid #e2e8f0; padding: .25em .7em; text-align: left;
   vertical-align: top; }

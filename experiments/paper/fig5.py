@@ -15,6 +15,8 @@ TASKS: dict[str, tuple[str, tuple[str, ...], tuple[int, ...]]] = {
     "circuit": ("default", ("circuit",), (3, 4)),
     "jam": ("N=8", ("jam",), (2, 3)),
 }
+ALMOST = 80  # per cent
+COMPETITIVE = 0.9  # of the best return that keeps c
 LEARNERS = ("dqn", "cpo", "pid")  # folders inside a comparison
 KEPT = ("method", "seed", "steps", "episodes", "return_mean", "crashes")
 
@@ -110,15 +112,15 @@ def _ahead(of: dict[str, Any], env: str) -> list[Claim]:
     claims = [
         Claim(
             f"Figure 5, {env}: the highest return in almost all phases of training",
-            "almost all",
+            f"almost all ({ALMOST} %)",
             f"{highest:.0f} % of {len(ahead)} points",
-            holds(highest >= 80),
+            holds(highest >= ALMOST),
         ),
         Claim(
-            f"Figure 5, {env}: the lowest crash rate throughout",
-            "lowest",
+            f"Figure 5, {env}: the lowest crash rate, in almost all phases",
+            f"lowest ({ALMOST} %)",
             f"{lowest:.0f} % of {len(safer)} points",
-            holds(lowest >= 95),
+            holds(lowest >= ALMOST),
         ),
     ]
     if three is not None:
@@ -159,12 +161,12 @@ def _gather(of: dict[str, Any]) -> list[Claim]:
         Claim(
             "Section 5.3, point_gather: x = .5 is competitive and keeps c = .1, from the same "
             "threat function",
-            "competitive, danger below .1",
+            f"competitive ({100 * COMPETITIVE:.0f} % of the best that keeps c), danger below .1",
             f"return {wide['return_mean']:.2f} +- {wide['return_ci95']:.2f}, bombs an episode "
             f"{mean:.4f}{rival}",
             holds(
                 mean <= limit
-                and (safest is None or wide["return_mean"] >= 0.9 * safest["return_mean"])
+                and (safest is None or wide["return_mean"] >= COMPETITIVE * safest["return_mean"])
             ),
         ),
     ]

@@ -1,10 +1,13 @@
 """Runs that results are taken from: each made once, in a process of its own, and resumed."""
 
+import fcntl
 import resource
 import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -32,17 +35,19 @@ class Sources:
         """The folder of a finished run; makes or resumes the run, and those that it uses, first.
 
         Raises:
-            RunError: it ended with an error, now or earlier in this process.
+            RunError: it ended with an error, now or earlier in this process, or another process
+                is making it.
             KeyboardInterrupt: it was interrupted.
         """
         folder = self._folder / name
         if name in self._failed:
             raise RunError(self._failed[name])
-        if not finished(folder):
-            self._make(name, folder)
+        with locked(self._folder / ".locks" / name) as lock:
+            if not finished(folder):
+                self._make(name, folder, lock)
         return folder
 
-    def _make(self, name: str, folder: Path) -> None:
+    def _make(self, name: str, folder: Path, lock: int) -> None:
         module, *rest = words(name, self._preset)
         for i, word in enumerate(rest):
             if word.startswith("@"):
@@ -58,7 +63,7 @@ class Sources:
         command = ["python", "-m", f"experiments.{module}", *rest]
         console.say(f"{name}: {' '.join(command)}", style="bold")
         entry: dict[str, Any] = {"command": " ".join(command), "commit": commit()}
-        ended = timed(command)
+        ended = timed(command, lock)
         if folder.exists():
             storage.write_json(folder / LOG, [*log, entry | ended])
         if ended["interrupted"] or ended["exit"] == 130:
@@ -66,6 +71,22 @@ class Sources:
         if ended["exit"] != 0:
             self._failed[name] = f"{entry['command']}: exit status {ended['exit']}"
             raise RunError(self._failed[name])
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[int]:
+    """Holds a lock as long as this process, or one that was given its descriptor, lives.
+
+    Raises:
+        RunError: another process holds it.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise RunError(f"{path.name}: another process is making this run") from error
+        yield file.fileno()
 
 
 def finished(folder: Path) -> bool:
@@ -85,15 +106,19 @@ def _begun(folder: Path) -> bool:
     return (folder / "config.json").exists() and "experiment" in settings.read(folder)
 
 
-def timed(command: list[str]) -> dict[str, Any]:
+def timed(command: list[str], lock: int) -> dict[str, Any]:
     """Runs a command to its end, also after Ctrl-C, which reaches it too.
+
+    Args:
+        command: its first word stands for this interpreter.
+        lock: descriptor that the process inherits.
 
     Returns:
         Exit status, whether there was a Ctrl-C, wall and CPU seconds.
     """
     began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
     interrupted = False
-    with subprocess.Popen([sys.executable, *command[1:]]) as process:
+    with subprocess.Popen([sys.executable, *command[1:]], pass_fds=(lock,)) as process:
         try:
             while process.returncode is None:
                 try:

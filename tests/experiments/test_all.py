@@ -27,7 +27,8 @@ class Runs:
         self.commands, self.exits, self.stops = [], {}, set()
         monkeypatch.setattr(module, "timed", self.timed)
 
-    def timed(self, command):
+    def timed(self, command, lock):
+        assert lock > 2
         self.commands.append(" ".join(command))
         option = "--resume" if "--resume" in command else "--out"
         folder = module.Path(command[command.index(option) + 1])
@@ -95,8 +96,17 @@ def test_a_run_that_ended_after_its_parent_is_finished(runs, tmp_path):
     assert runs.commands == []
 
 
+def test_a_run_that_another_process_makes_is_left_alone(runs, tmp_path):
+    sources = module.Sources(tmp_path, "quick")
+    with module.locked(tmp_path / ".locks" / "jam"):
+        with pytest.raises(module.RunError, match="jam: another process"):
+            sources("jam")
+        assert runs.commands == []
+    assert sources("jam").exists()  # later it can be had
+
+
 def test_processes_are_timed_and_their_ends_told():
-    found = module.timed(["python", "-c", "raise SystemExit(3)"])
+    found = module.timed(["python", "-c", "raise SystemExit(3)"], 0)
     assert (found["exit"], found["interrupted"]) == (3, False)
     assert 0 < found["cpu_seconds"] < 60
     assert found["seconds"] > 0
