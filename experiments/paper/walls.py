@@ -14,7 +14,7 @@ from experiments import console, pipeline, runs
 from experiments.paper.section import Section, Table
 from rp_jax import evaluate
 from rp_jax.envs.base import Hazards
-from rp_jax.hazards import WallPoint
+from rp_jax.hazards import SubRMDP, WallPoint
 from rp_jax.recon import labels
 from rp_jax.threat import report
 from rp_jax.threat.total import total_threat
@@ -53,25 +53,29 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
         states = jax.jit(evaluate.visited_states, static_argnums=2)(key, pmdp, STATES)
         points = jax.jit(jax.vmap(pmdp.env.hazards, (0, None)))(states, pmdp.params)["wall"]
         sub = pmdp.env.sub_rmdps(pmdp.params)["wall"]
-        exact = labels.exact_threat
         with console.progress(f"walls, {env}") as bar:
-            bar("", 0, 2, "jointly")
-            walls: Any = Walls(wall=sub.source)
-            joint = labels.label(
-                key, states.agent, points, sub.replace(source=walls), exact, rows=STATES
-            )
-            bar("", 1, 2, "summed")
-            summed = report.labelled_sum(key, states.agent, points, sub, exact)
-            bar("", 2, 2)
+            bar("", 0, 1)
+            joint, summed = exact(key, states.agent, points, sub)
+            bar("", 1, 1)
         assert pmdp.threats is not None
         said = total_threat({"wall": pmdp.threats["wall"]}, states.agent, {"wall": points})
-        kinds = {"joint, exact": joint.threat, "sum, exact": summed, "sum, models": said}
+        kinds = {"joint, exact": joint, "sum, exact": summed, "sum, models": said}
         for name, threat in kinds.items():
             rows.append(
                 {"env": env, "of": name, "x": loaded.config.x}
-                | compared(np.asarray(threat), np.asarray(joint.threat), loaded.config.x)
+                | compared(np.asarray(threat), joint, loaded.config.x)
             )
     return rows
+
+
+def exact(key: Array, agents: Any, points: Hazards, sub: SubRMDP) -> tuple[np.ndarray, np.ndarray]:
+    """(joint, summed) threats (B, A) of the wall points near agents (B, ...)."""
+    walls: Any = Walls(wall=sub.source)
+    both = sub.replace(source=walls)
+    count = points.present.shape[0]
+    joint = labels.label(key, agents, points, both, labels.exact_threat, rows=count)
+    summed = report.labelled_sum(key, agents, points, sub, labels.exact_threat)
+    return np.asarray(joint.threat), summed
 
 
 def compared(threat: np.ndarray, joint: np.ndarray, x: float) -> dict[str, Any]:
