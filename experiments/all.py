@@ -150,7 +150,10 @@ def blocks(folder: Path, preset: str, failed: dict[str, str]) -> list[report.Blo
         out += [report.Heading("Not made yet"), ", ".join(missing)]
     if failed:
         out += [report.Heading("Failed"), *(f"{name}: {why}" for name, why in failed.items())]
-    return [*out, report.Heading("What was run"), report.Grid("Runs", ledger(folder / "runs"))]
+    lines = ledger(folder / "runs")
+    hours, cpu = (sum(float(line[k]) for line in lines) / 60 for k in ("minutes", "CPU minutes"))
+    took = f"{len(lines)} runs took {hours:.1f} hours, {cpu:.1f} CPU hours."
+    return [*out, report.Heading("What was run"), took, report.Grid("Runs", lines)]
 
 
 def ledger(folder: Path) -> list[dict[str, Any]]:

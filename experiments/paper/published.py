@@ -99,6 +99,7 @@ SECONDS: dict[str, dict[str, float]] = {
     "circuit": {"RP": 0.5, "MPC (4 steps)": 18.2, "DQN": 0.4},
     "jam": {"RP": 1.2, "MPC (3 steps)": 285.0, "DQN": 0.4},
 }
+THREAT_MINUTES = 40.0  # 10 to sample, less than 30 to fit
 TRAINING_HOURS = 24.0  # 3M steps of one seed of one task, on a GPU
 
 # The released agents, played again: return with its 95 % interval, crashes.

@@ -265,20 +265,21 @@ def test_all_methods_are_timed_in_one_process(circuit_runs, tmp_path, monkeypatc
     monkeypatch.setattr(timing, "ROUNDS", 1)
     monkeypatch.setattr(timing.mpc, "action_seconds", lambda key, search: (search.horizon, 0.0))
     results = timing.run(circuit_runs, tmp_path)
-    found = {row["method"]: row["seconds"] for row in results}
+    found = {row["method"]: row["seconds"] for row in results["actions"]}
     assert list(found) == ["RP", "DQN", "CPO", "MPC (1 steps)", "MPC (4 steps)"]
     assert found["MPC (4 steps)"] == [4]
     assert all(len(seconds) == 1 and min(seconds) > 0 for seconds in found.values())
-    assert {row["variant"] for row in results} == {"circle"}
+    assert {row["variant"] for row in results["actions"]} == {"circle"}
     claims = {claim.claim: claim for claim in timing.tell(results).claims}
     assert claims["Computation time, circuit: MPC (4 steps), 100 actions"].verdict == "exceeded"
 
 
 def test_walls_jointly_are_never_more_threatening_than_summed():
     params = circuit.make_params(circle_plan(), horizon=2)
-    states = jax.vmap(circuit.reset, (0, None))(jax.random.split(jax.random.key(0), 8), params)
+    reset = jax.jit(jax.vmap(circuit.reset, (0, None)))
+    states = reset(jax.random.split(jax.random.key(0), 8), params)
     fast = states.replace(agent=states.agent.replace(speed=jnp.full(8, 0.1)))
-    points = jax.vmap(circuit.hazards, (0, None))(fast, params)["wall"]
+    points = jax.jit(jax.vmap(circuit.hazards, (0, None)))(fast, params)["wall"]
     sub = circuit.sub_rmdps(params)["wall"]
     near = fast.agent.replace(position=points.state[:, 0] + jnp.asarray([0.2, 0.0]))
     joint, summed = walls.exact(jax.random.key(0), near, points, sub)
