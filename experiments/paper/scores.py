@@ -75,24 +75,24 @@ def shown(row: Row) -> str:
 def table(
     title: str, scores: Sequence[Row], paper: Mapping[str, Mapping[str, published.Score]]
 ) -> Table:
-    """Ours and the paper's, a line per variant and method."""
+    """Ours and the paper's (if there are any), a line per variant and method."""
     lines = []
     for variant in dict.fromkeys(row["variant"] for row in scores):
         for row in scores:
             if row["variant"] != variant:
                 continue
-            known = paper.get(variant, {}).get(_plain(row["method"]))
-            lines.append(
-                {
-                    "variant": variant,
-                    "method": row["method"],
-                    "seeds": row["seeds"],
-                    "return": f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}",
-                    "crashes": f"{row['crashes']:,} of {row['episodes']:,}",
-                    "crash rate, % [95 %]": tables.percent(row),
-                    "paper: return (rate)": f"{known[0]:g} ({known[1]:g})" if known else "",
-                }
-            )
+            line = {
+                "variant": variant,
+                "method": row["method"],
+                "seeds": row["seeds"],
+                "return": f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}",
+                "crashes": f"{row['crashes']:,} of {row['episodes']:,}",
+                "crash rate, % [95 %]": tables.percent(row),
+            }
+            if paper:
+                known = paper.get(variant, {}).get(_plain(row["method"]))
+                line["paper: return (rate)"] = f"{known[0]:g} ({known[1]:g})" if known else ""
+            lines.append(line)
     return Table(title, lines)
 
 

@@ -196,9 +196,10 @@ def scores(
             axis.grid(alpha=0.3)
     axes[-1, 0].set_xlabel("return (crash penalty included)")
     axes[-1, 1].set_xlabel("episodes with a crash, %")
-    axes[0, 0].plot([], [], "o", color=BLUE, markersize=4, label="ours, 95 %")
-    axes[0, 0].plot([], [], "D", color=RED, markersize=4, fillstyle="none", label="paper")
-    axes[0, 0].legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.55, 1.0), ncols=2)
+    if published:
+        axes[0, 0].plot([], [], "o", color=BLUE, markersize=4, label="ours, 95 %")
+        axes[0, 0].plot([], [], "D", color=RED, markersize=4, fillstyle="none", label="paper")
+        axes[0, 0].legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.55, 1.0), ncols=2)
     figure.savefig(path, dpi=120)
     plt.close(figure)
 

@@ -77,8 +77,16 @@ def trajectories(
     """Paths of several episodes per panel (figure 6); S marks the start, red crosses crashes."""
     columns = min(3, len(panels))
     lines = -(-len(panels) // columns)
+    extents = [np.ptp(scene.walls, axis=0) for _, scene, _ in panels]
+    shapes = [float(height / width) for width, height in extents]  # of the panels
+    heights = [5 * max(shapes[i * columns : (i + 1) * columns]) + 0.3 for i in range(lines)]
     figure, axes = plt.subplots(
-        lines, columns, figsize=(5 * columns, 4.6 * lines), layout="constrained", squeeze=False
+        lines,
+        columns,
+        figsize=(5 * columns, sum(heights)),
+        height_ratios=heights,
+        layout="constrained",
+        squeeze=False,
     )
     for axis in axes.flat[len(panels) :]:
         axis.axis("off")
