@@ -15,6 +15,7 @@ from experiments import all as everything
 from experiments import compare, pipeline
 from experiments.paper import commands, fig5, published, scores, section, table1, tables3_4, walls
 from experiments.paper import training_crashes as crashes
+from experiments.runs import EXPERIMENTS
 from rp_jax import storage
 from rp_jax.evaluate import Episodes, summarise
 
@@ -156,7 +157,7 @@ def parsed(name, preset):
             if module_name == "compare":
                 compare.settings_of(config)
             elif module_name == "mpc":
-                module.prepare(config)
+                assert config.env in EXPERIMENTS
             else:
                 config.validate()
             return config
@@ -199,7 +200,7 @@ def test_one_switch_differs_from_the_first_table():
     }.items():
         changed = dataclasses.asdict(parsed(name, "full"))
         found = {key for key, value in changed.items() if value != reference[key]}
-        assert found - {"seeds", "threat", "test_obstacles", "figures"} == switched
+        assert found - {"seeds", "episodes", "threat", "test_obstacles", "figures"} == switched
 
 
 def test_sums_over_walls_are_compared_with_the_joint_threat():
