@@ -11,6 +11,7 @@ from rp_jax import statistics
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.ticker import EngFormatter, MaxNLocator
 
 BLUE, RED, GREY = "#2b6cb0", "#c53030", "#718096"
 
@@ -104,6 +105,8 @@ def methods(
         _percent(column[1], "y")
         column[1].set_xlabel("agent steps")
         column[1].tick_params(labelbottom=True)
+        column[1].xaxis.set_major_locator(MaxNLocator(6))
+        column[1].xaxis.set_major_formatter(EngFormatter(sep=""))
         for axis in column[:2]:
             axis.grid(alpha=0.3)
         column[2].axis("off")
