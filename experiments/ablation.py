@@ -79,5 +79,5 @@ def run(
     if config.figures:
         from rp_jax.plot import curves
 
-        curves.methods(trained.history, task.name, folder / "learning_curves.png")
+        curves.methods({task.name: trained.history}, folder / "learning_curves.png")
     console.say(f"results: {folder}")

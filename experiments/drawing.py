@@ -1,5 +1,6 @@
 """Figures that all tasks share, from a finished run."""
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ from experiments.pipeline import MEDIA, Finished, key_of
 from rp_jax import evaluate
 from rp_jax.kinematics import Vehicle, make_vehicle
 from rp_jax.planning import loop
+from rp_jax.planning.pmdp import PMDP, Percept
 from rp_jax.plot import curves, maps, scenes
 from rp_jax.threat.report import predict
 
@@ -30,20 +32,45 @@ def play(
     pmdp = run.pmdp.replace(params=params)
     network = loop.make_network(run.config.planning, pmdp)
     weights = jax.tree.map(lambda a: a[0], run.trained.params)
+    key = key_of(run.config.seed, MEDIA)
+    return recorded(
+        key, pmdp, starts, steps, functools.partial(evaluate.greedy, network), weights, obstacles
+    )
 
+
+def recorded(
+    key: jax.Array,
+    pmdp: PMDP,
+    starts: Any,
+    steps: int,
+    policy: Callable[[Any], Callable[[Percept], jax.Array]],
+    weights: Any,
+    obstacles: Callable[[Any], Vehicle] | None = None,
+) -> list[scenes.Episode]:
+    """Episodes of any policy.
+
+    Args:
+        key: of the environment's randomness.
+        pmdp: the environment, and what is admissible.
+        starts: states (n,).
+        steps: of an episode, at most.
+        policy: from `weights` to scores of the actions.
+        weights: a pytree of arrays.
+        obstacles: finds what else is drawn in a batch of states.
+    """
     # One row more than steps, so that the state after the last one is seen too.
     rows = steps + 1
 
     @jax.jit
     def go(key, pmdp, weights, starts):
-        return evaluate.record(key, pmdp, evaluate.greedy(network, weights), starts, rows)
+        return evaluate.record(key, pmdp, policy(weights), starts, rows)
 
-    shown = jax.tree.map(np.asarray, go(key_of(run.config.seed, MEDIA), pmdp, weights, starts))
+    shown = jax.tree.map(np.asarray, go(key, pmdp, weights, starts))
     count = shown.alive.shape[1]
     empty = np.zeros((rows, count, 0, 2))
     others = obstacles(shown.states) if obstacles else None
-    over_episodes = jax.vmap(run.task.env.causes, (0, None))
-    causes = jax.jit(jax.vmap(over_episodes, (0, None)))(shown.states, params)
+    over_episodes = jax.vmap(pmdp.env.causes, (0, None))
+    causes = jax.jit(jax.vmap(over_episodes, (0, None)))(shown.states, pmdp.params)
     hit = np.any(list(causes.values()), axis=0)
     episodes = []
     for i in range(count):

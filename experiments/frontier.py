@@ -94,8 +94,6 @@ def summarised(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     found = []
     for (planner, variant, x), group in groups.items():
         (summary,) = tables.over_seeds(group)
-        if len(group) == 1:  # over the episodes of the one
-            summary["return_ci95"] = group[0]["return_ci95"]
         insecure = float(np.mean([row["insecure"] for row in group]))
         found.append(
             {"planner": planner, **summary, "variant": variant, "x": x, "insecure": insecure}

@@ -207,18 +207,19 @@ def _cell(name: str, value: Any) -> str:
     return value if isinstance(value, str) else f"{value:.{3 if 'danger' in name else 4}g}"
 
 
-def plot(results: Mapping[str, Any], folder: Path) -> None:
-    """Figures 2, 3a and 3b, and the rules' shares of the optimum."""
+def plot_map(shown: Mapping[str, Any], path: Path) -> None:
+    """Figure 2, from what `threat_map` found."""
     from rp_jax.plot import tabular
 
-    shown = results["map"]
-    tabular.lake(
-        shown["rows"],
-        np.asarray(shown["threat"]),
-        frozen_lake.ACTIONS,
-        f"action threat of eta*, T = {shown['horizon']}",
-        folder / "figure_2.png",
-    )
+    title = f"action threat of eta*, T = {shown['horizon']}"
+    threats = np.asarray(shown["threat"])
+    tabular.lake(shown["rows"], threats, frozen_lake.ACTIONS, title, path)
+
+
+def plot_rules(results: Mapping[str, Any], folder: Path) -> None:
+    """Figures 3a and 3b, and the rules' shares of the optimum."""
+    from rp_jax.plot import tabular
+
     tabular.budgets(results["rows"], results["optima"], BASELINES, folder / "figure_3.png")
     tabular.shares(results["rows"], tuple(thresholds.RULES), folder / "rules.png")
 
@@ -239,7 +240,8 @@ def main() -> None:
     storage.write_json(folder / "optima.json", others)
     show(results, config)
     if config.figures:
-        plot(results, folder)
+        plot_map(results["map"], folder / "figure_2.png")
+        plot_rules(results, folder)
     console.say(f"results: {folder}")
 
 

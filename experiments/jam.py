@@ -22,6 +22,7 @@ class Config(pipeline.Config):
 
     obstacles: int = 8  # while learning
     test_obstacles: tuple[int, ...] = (3, 8, 15)  # while testing
+    obstacle_horizon: int = 8  # steps after which the threat of an obstacle is cut
     wall: ThreatConfig = field(default_factory=lambda: recipes.TUNED_WALL)  # threat of a wall point
     obstacle: ThreatConfig = field(default_factory=lambda: recipes.TUNED_OBSTACLE)  # of an obstacle
 
@@ -53,7 +54,12 @@ def make_task(config: Config) -> pipeline.Task:
         raise ValueError("test_obstacles is (); it must name at least one count")
 
     def params(n: int) -> jam.Params:
-        return jam.make_params(n, fidelity=config.fidelity, baseline=config.baseline)
+        return jam.make_params(
+            n,
+            obstacle_horizon=config.obstacle_horizon,
+            fidelity=config.fidelity,
+            baseline=config.baseline,
+        )
 
     return pipeline.Task(
         name="jam",

@@ -80,10 +80,19 @@ def load(folder: Path) -> Run:
         models = artefact.load(threats, task.name, subs)
         used.append(threats / "manifest.json")
     pmdp = pipeline.make_pmdp(task, config, models, task.train)
-    shapes = jax.eval_shape(
-        lambda key: loop.begin(key, pmdp, config.planning).learner.params, jax.random.key(0)
-    )
-    like = jax.tree.map(lambda s: jax.ShapeDtypeStruct((config.seeds, *s.shape), s.dtype), shapes)
-    params = storage.load(folder / "agent", "Q-network", like)
+    params = agents(folder / "agent", pmdp, config.planning, config.seeds)
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in used)).hexdigest()
     return Run(task, config, models, params, digest)
+
+
+def agents(folder: Path, pmdp: PMDP, planning: loop.LoopConfig, count: int) -> Any:
+    """Parameters of saved Q-networks, leading axis (count,).
+
+    Raises:
+        ValueError: they are missing, damaged, or of another number or shape.
+    """
+    shapes = jax.eval_shape(
+        lambda key: loop.begin(key, pmdp, planning).learner.params, jax.random.key(0)
+    )
+    like = jax.tree.map(lambda s: jax.ShapeDtypeStruct((count, *s.shape), s.dtype), shapes)
+    return storage.load(folder, "Q-network", like)

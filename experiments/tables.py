@@ -81,11 +81,15 @@ def percent(row: Mapping[str, Any]) -> str:
 
 
 def over_seeds(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Per variant, the mean and interval of the seeds' returns, and all their crashes together."""
+    """Per variant, the mean and interval of the seeds' returns, and all their crashes together.
+
+    The interval is that of the mean over seeds; of one seed alone, over its episodes.
+    """
     found = []
     for variant in dict.fromkeys(row["variant"] for row in rows):
         of = [row for row in rows if row["variant"] == variant]
         mean, width = statistics.mean_interval(np.asarray([row["return_mean"] for row in of]))
+        width = width if len(of) > 1 else of[0]["return_ci95"]
         n, k = sum(r["episodes"] for r in of), sum(r["crashes"] for r in of)
         found.append(
             {

@@ -37,6 +37,7 @@ class DQNConfig:
     polyak: float = 0.01  # 0: copy every `period`
     period: int = 1000  # updates between copies
     reward_scale: float = 0.1
+    masked_target: bool = True  # maximum over admissible actions; False: over all
 
     def validate(self, name: str) -> None:
         """Raises ValueError, naming the field after `name`, if a value is out of range."""
@@ -113,6 +114,8 @@ def update(
     online = jnp.asarray(network.apply(learner.params, batch.next_encoded))
     target = jnp.asarray(network.apply(learner.target, batch.next_encoded))
     admissible = jax.vmap(shield.from_bits, (0, None))(batch.next_admissible, online.shape[-1])
+    if not config.masked_target:
+        admissible = jnp.ones_like(admissible)
     reward = batch.reward * config.reward_scale
     goal = jax.vmap(double_q_target)(reward, batch.discount, online, target, admissible)
 

@@ -11,6 +11,7 @@ from rp_jax import statistics
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.ticker import EngFormatter, MaxNLocator
 
 BLUE, RED, GREY = "#2b6cb0", "#c53030", "#718096"
 
@@ -65,34 +66,143 @@ def learning_curves(history: Sequence[Mapping[str, Any]], title: str, path: Path
     plt.close(figure)
 
 
-def methods(history: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
-    """Return and crash rate while learning, a line per method; seeds taken together.
+def methods(
+    panels: Mapping[str, Sequence[Mapping[str, Any]]],
+    path: Path,
+    levels: Mapping[str, Sequence[Mapping[str, Any]]] | None = None,
+) -> None:
+    """Return and crash rate while learning: a column per task, a line per method.
+
+    Lines are means over seeds, bands 90 % intervals of Student; of one seed, the band of the crash
+    rate is the 90 % interval of Clopper and Pearson.
 
     Args:
-        history: one row per chunk, method and seed, as in metrics.jsonl.
-        title: of the figure.
+        panels: by title, one row per chunk, method and seed, as in metrics.jsonl.
+        path: of the PNG.
+        levels: by title, rows of what does not learn: method, return_mean, crash_rate; dashed.
+    """
+    most = max(len({row["method"] for row in history}) for history in panels.values())
+    below = 0.12 + 0.06 * (most // 2 + 2)  # for the legend
+    figure, axes = plt.subplots(
+        3,
+        len(panels),
+        figsize=(max(7, 4.6 * len(panels)), 6.6),
+        height_ratios=(1, 1, below),
+        sharex="col",
+        layout="constrained",
+        squeeze=False,
+    )
+    for column, (title, history) in zip(axes.T, panels.items(), strict=True):
+        colours = {True: iter(OURS), False: iter(OTHERS)}
+        for name in dict.fromkeys(row["method"] for row in history):
+            of = [row for row in history if row["method"] == name and row["episodes"]]
+            _line(column, of, next(colours[name.startswith("RP")], "black"), name)
+        for row, dashes in zip((levels or {}).get(title, ()), ("--", ":", "-."), strict=False):
+            style = {"color": "black", "linestyle": dashes, "linewidth": 1}
+            column[0].axhline(row["return_mean"], label=row["method"], **style)
+            column[1].axhline(100 * row["crash_rate"], **style)
+        column[0].set_title(title)
+        _percent(column[1], "y")
+        column[1].set_xlabel("agent steps")
+        column[1].tick_params(labelbottom=True)
+        column[1].xaxis.set_major_locator(MaxNLocator(6))
+        column[1].xaxis.set_major_formatter(EngFormatter(sep=""))
+        for axis in column[:2]:
+            axis.grid(alpha=0.3)
+        column[2].axis("off")
+        handles, labels = column[0].get_legend_handles_labels()
+        column[2].legend(handles, labels, loc="upper center", fontsize=8, ncols=2)
+    axes[0, 0].set_ylabel("return while exploring\n(crash penalty included)")
+    axes[1, 0].set_ylabel("episodes with a crash, %")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+OURS = (BLUE, "#63b3ed")
+OTHERS = (RED, "#dd6b20", "#d69e2e", "#2f855a", "#805ad5", "#d53f8c", GREY)
+
+
+def _percent(axis: Any, which: str) -> None:
+    """Crash rates from none to all on one scale; `which` is "x" or "y"."""
+    getattr(axis, f"set_{which}scale")("symlog", linthresh=0.01)
+    getattr(axis, f"set_{which}lim")(-0.001, 130)
+    ticks, names = [0, 0.01, 0.1, 1, 10, 100], ["0", ".01", ".1", "1", "10", "100"]
+    getattr(axis, f"set_{which}ticks")(ticks, names)
+
+
+def _line(axes: Any, rows: Sequence[Mapping[str, Any]], colour: str, name: str) -> None:
+    """A method's return and crash rate, with their bands."""
+    steps = sorted({row["steps"] for row in rows})
+    groups = [[row for row in rows if row["steps"] == s] for s in steps]
+    returns = [_band([row["return_mean"] for row in group]) for group in groups]
+    rates = [_band([100 * row["crashes"] / row["episodes"] for row in group]) for group in groups]
+    for i, group in enumerate(groups):
+        if len(group) == 1:
+            k, n = group[0]["crashes"], group[0]["episodes"]
+            low, high = statistics.clopper_pearson(k, n, 0.9)
+            rates[i] = (rates[i][0], 100 * low, 100 * high)
+    for axis, found in zip(axes, (returns, rates), strict=False):
+        means, lows, highs = np.asarray(found).reshape(-1, 3).T
+        axis.plot(steps, means, color=colour, label=name)
+        axis.fill_between(steps, lows, highs, color=colour, alpha=0.2, linewidth=0)
+
+
+def _band(values: Sequence[float]) -> tuple[float, float, float]:
+    """(mean, low, high) of the 90 % interval; of one value, itself."""
+    mean, width = statistics.mean_interval(np.asarray(values), 0.9)
+    width = 0.0 if np.isnan(width) else width
+    return mean, mean - width, mean + width
+
+
+def scores(
+    rows: Sequence[Mapping[str, Any]],
+    published: Mapping[str, Mapping[str, tuple[float, float]]],
+    path: Path,
+) -> None:
+    """Return and crash rate by method with 95 % intervals, a line of panels per variant.
+
+    Args:
+        rows: with variant, method, return_mean, return_ci95, crash_rate, crash_ci95.
+        published: by variant and method, (return, crash rate): diamonds.
         path: of the PNG.
     """
-    figure, axes = plt.subplots(2, 1, figsize=(7, 5.5), sharex=True, layout="constrained")
-    names = dict.fromkeys(row["method"] for row in history)
-    for colour, name in zip((GREY, RED, BLUE), names, strict=False):
-        of = [row for row in history if row["method"] == name and row["episodes"]]
-        steps = sorted({row["steps"] for row in of})
-        groups = [[row for row in of if row["steps"] == s] for s in steps]
-        returns = [np.mean([row["return_mean"] for row in group]) for group in groups]
-        axes[0].plot(steps, returns, color=colour, label=name)
-        counts = [[sum(r[k] for r in g) for k in ("crashes", "episodes")] for g in groups]
-        axes[1].plot(steps, [100 * k / n for k, n in counts], color=colour)
-        bounds = np.asarray([statistics.clopper_pearson(k, n) for k, n in counts])
-        axes[1].fill_between(steps, *(100 * bounds).T, color=colour, alpha=0.2, linewidth=0)
-    axes[0].set_ylabel("return while exploring\n(crash penalty included)")
-    axes[1].set_ylabel("episodes with a crash, %\n(shaded: 95 % Clopper-Pearson)")
-    axes[1].set_xlabel("agent steps")
-    axes[1].set_ylim(bottom=0)
-    axes[0].legend()
-    for axis in axes:
-        axis.grid(alpha=0.3)
-    figure.suptitle(title)
+    variants = list(dict.fromkeys(row["variant"] for row in rows))
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    figure, axes = plt.subplots(
+        len(variants),
+        2,
+        figsize=(10, (0.9 + 0.27 * len(methods)) * len(variants)),
+        sharey=True,
+        layout="constrained",
+        squeeze=False,
+    )
+    for (left, right), variant in zip(axes, variants, strict=True):
+        for row in rows:
+            if row["variant"] != variant:
+                continue
+            y, rate = len(methods) - methods.index(row["method"]), 100 * row["crash_rate"]
+            low, high = (100 * bound for bound in row["crash_ci95"])
+            style = {"fmt": "o", "color": BLUE, "markersize": 4, "capsize": 2}
+            left.errorbar(row["return_mean"], y, xerr=row["return_ci95"], **style)
+            error = [[max(0.0, rate - low)], [max(0.0, high - rate)]]
+            right.errorbar(rate, y, xerr=error, **style)
+        for method, (earned, rate) in published.get(variant, {}).items():
+            if method in methods:
+                below = len(methods) - methods.index(method) - 0.25
+                for axis, value in ((left, earned), (right, 100 * rate)):
+                    axis.plot(value, below, "D", color=RED, markersize=4, fillstyle="none")
+        left.set_yticks(range(len(methods), 0, -1), methods, fontsize=8)
+        left.set_ylim(0.3, len(methods) + 0.7)
+        left.set_title(variant, loc="left", fontsize=10)
+        _percent(right, "x")
+        for axis in (left, right):
+            axis.grid(alpha=0.3)
+    axes[-1, 0].set_xlabel("return (crash penalty included)")
+    axes[-1, 1].set_xlabel("episodes with a crash, %")
+    if published:
+        axes[0, 0].plot([], [], "o", color=BLUE, markersize=4, label="ours, 95 %")
+        axes[0, 0].plot([], [], "D", color=RED, markersize=4, fillstyle="none", label="paper")
+        axes[0, 0].legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.55, 1.0), ncols=2)
     figure.savefig(path, dpi=120)
     plt.close(figure)
 

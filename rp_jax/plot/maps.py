@@ -59,5 +59,5 @@ def heat_maps(panels: Sequence[Panel], x: float, path: Path, decorate=None) -> N
             decorate(axis, i)
     scale = ScalarMappable(LogNorm(FLOOR, 1.0, clip=True), "inferno")
     figure.colorbar(scale, ax=axes, label=f"threat (cyan: x = {x:g})", shrink=0.8)
-    figure.savefig(path, dpi=120)
+    figure.savefig(path, dpi=120, bbox_inches="tight")
     plt.close(figure)

@@ -43,6 +43,13 @@ class Episode(NamedTuple):
     hit: np.ndarray  # (t,) bool, danger was met on the way here
 
 
+class Path2D(NamedTuple):
+    """What `trajectories` draws of an episode."""
+
+    position: np.ndarray  # (t, 2)
+    hit: np.ndarray  # (t,) bool
+
+
 def draw_scene(axis: Any, scene: Scene) -> None:
     """Walls as dots, safety zones shaded, rings about their places."""
     low, high = scene.walls.min(axis=0), scene.walls.max(axis=0)
@@ -64,12 +71,22 @@ def draw_scene(axis: Any, scene: Scene) -> None:
     axis.set_yticks([])
 
 
-def trajectories(panels: Sequence[tuple[str, Scene, Sequence[Episode]]], path: Path) -> None:
+def trajectories(
+    panels: Sequence[tuple[str, Scene, Sequence[Episode | Path2D]]], path: Path
+) -> None:
     """Paths of several episodes per panel (figure 6); S marks the start, red crosses crashes."""
     columns = min(3, len(panels))
     lines = -(-len(panels) // columns)
+    extents = [np.ptp(scene.walls, axis=0) for _, scene, _ in panels]
+    shapes = [float(height / width) for width, height in extents]  # of the panels
+    heights = [5 * max(shapes[i * columns : (i + 1) * columns]) + 0.3 for i in range(lines)]
     figure, axes = plt.subplots(
-        lines, columns, figsize=(5 * columns, 4.6 * lines), layout="constrained", squeeze=False
+        lines,
+        columns,
+        figsize=(5 * columns, sum(heights)),
+        height_ratios=heights,
+        layout="constrained",
+        squeeze=False,
     )
     for axis in axes.flat[len(panels) :]:
         axis.axis("off")

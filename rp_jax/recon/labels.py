@@ -185,15 +185,15 @@ def leaves(sub: SubRMDP) -> int:
     return sub.agent.num_threats * controls**power
 
 
-def best_estimator(sub: SubRMDP, paths: int) -> Estimator:
+def best_estimator(sub: SubRMDP, paths: int, exact: bool = True) -> Estimator:
     """Exact enumeration where the hazard stays put and the tree is small enough.
 
-    Elsewhere Monte Carlo with `paths` rollouts, at least 1.
+    Elsewhere, or if not `exact`, Monte Carlo with `paths` rollouts, at least 1.
     """
     number("paths", paths, least=1, integer=True)
     if isinstance(sub.agent.baseline, Plans):
         return _sampled(plan_threat, paths)
-    if sub.source.static and leaves(sub) <= MOST_LEAVES:
+    if exact and sub.source.static and leaves(sub) <= MOST_LEAVES:
         return exact_threat
     return _sampled(monte_carlo_threat, paths)
 

@@ -31,6 +31,7 @@ class ThreatConfig:
 
     states: int = 200_000  # labelled start states
     paths: int = 64  # rollouts per state, where the label is not exact
+    exact: bool = True  # labels are, where all rollouts can be enumerated; False: nowhere
     sampling: str = "uniform"  # of the start states: uniform or preferential
     prudence: float = 1.0  # most states near x with an unsafe action called safe; 1: as fitted
     confidence: float = 0.95  # of that
@@ -207,7 +208,7 @@ def build(
     config.validate("config")
     number("x", x, least=0, infinite=True)
     keys = jax.random.split(key, 9)
-    estimator = labels.best_estimator(sub, config.paths)
+    estimator = labels.best_estimator(sub, config.paths, config.exact)
     accurate = labels.best_estimator(sub, config.test_paths)
     began = time.perf_counter()
     first = config.states // 2 if config.sampling == "preferential" else config.states

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 
 from examples.crossing import world as crossing
 from examples.trolley import world as trolley
-from rp_jax.envs import base, circuit, jam, point_gather
+from rp_jax.envs import base, circuit, jam, patrol, point_gather
 from rp_jax.hazards import SubRMDP
 
 ENVS = {
@@ -27,6 +27,7 @@ ENVS = {
         point_gather,
         lambda: point_gather.make_params(0, 1, fidelity="paper"),
     ),
+    "patrol": (patrol, lambda: patrol.make_params(3)),
     "crossing": (crossing, lambda: crossing.make_params()),
     "trolley": (trolley, lambda: trolley.make_params(20)),
 }

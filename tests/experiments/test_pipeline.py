@@ -221,6 +221,7 @@ def test_methods_are_named_by_what_sets_them_apart():
 
 def test_seeds_are_summed_up_by_hand():
     row = {"variant": "a", "seed": 0, "episodes": 10, "crashes": 1, "return_mean": 1.0}
+    row["return_ci95"] = 0.5
     rows = [row, {**row, "seed": 1, "return_mean": 3.0, "crashes": 0}, {**row, "variant": "b"}]
     both, single = tables.over_seeds(rows)
     assert (both["variant"], both["seeds"]) == ("a", 2)
@@ -229,7 +230,7 @@ def test_seeds_are_summed_up_by_hand():
     assert (both["crashes"], both["episodes"], both["crash_rate"]) == (1, 20, 0.05)
     assert both["crash_ci95"][0] < 0.05 < both["crash_upper95"] < both["crash_ci95"][1]
     assert (single["variant"], single["seeds"]) == ("b", 1)
-    assert np.isnan(single["return_ci95"])
+    assert single["return_ci95"] == 0.5  # over its episodes
 
 
 @pytest.mark.slow

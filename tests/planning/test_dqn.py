@@ -84,6 +84,15 @@ def test_inadmissible_values_do_not_reach_the_target(huge):
     assert found == pytest.approx(1 + 0.9 * 10)
 
 
+def test_a_target_that_is_not_masked_takes_the_best_of_all_actions():
+    values = jnp.asarray([[0.0, 0.0, 0.0], [3.0, 2.0, 5.0]])
+    items = batch([0], [0], [1.0], [0.9], [1], [NOT_LAST])
+    for masked, best in ((True, 3.0), (False, 5.0)):
+        config = dataclasses.replace(CONFIG, masked_target=masked)
+        _, _, errors = update(learner(values, values, config), items, config=config)
+        assert errors[0] == pytest.approx(0.0 - (1 + 0.9 * best))
+
+
 def test_an_update_learns_from_the_least_threatening_action_where_nothing_is_secure():
     threat = jnp.asarray([[0.5, 0.2, 0.3]])
     mask = jax.vmap(shield.shield, (0, None))(threat, 0.01).admissible

@@ -49,7 +49,7 @@ def history(seeds=2, chunks=5, silent=1):
 
 def test_methods_are_compared(path):
     rows = [{**row, "method": f"method {row['seed']}"} for row in history(seeds=3)]
-    curves.methods(rows, "title", path)
+    curves.methods({"one": rows, "two": rows[:5]}, path)
     drawn(path)
 
 

@@ -234,6 +234,7 @@ def test_one_path_claims_no_precision():
 
 def test_hazards_that_stay_put_are_enumerated_and_others_simulated():
     assert best_estimator(sub_of(jam, "wall"), 64) is exact_threat
+    assert best_estimator(sub_of(jam, "wall"), 64, exact=False).func is monte_carlo_threat
     agent, other, sub = uncertain()
     found = jax.jit(best_estimator(sub, 200))(jax.random.key(0), agent, other, sub)
     expected = simulate(jax.random.key(0), agent, other, sub, paths=200)

@@ -1,0 +1,199 @@
+"""Every figure and table of the paper, and what goes beyond it, with a report.
+
+Each result has a folder in --out, and so has each run that results are taken from, in --out/runs.
+What is finished is not done again: --resume DIR goes on where it was stopped, and with --only
+makes some results (or runs) alone. Several processes may work in one folder: a run is made by one
+of them, and what needs it fails in the others until it is finished.
+
+python -m experiments.all --preset quick
+"""
+
+import gc
+import os
+import signal
+import sys
+import traceback
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import jax
+import tyro
+
+from experiments import cli, console, pipeline, report, settings
+from experiments.paper import (
+    ablations,
+    crowds,
+    fig2,
+    fig3,
+    fig4,
+    fig5,
+    fig6,
+    paper_recipe,
+    second_reward,
+    table1,
+    table2,
+    tables3_4,
+    theorems,
+    thresholds,
+    timing,
+    training_crashes,
+    walls,
+)
+from experiments.paper.commands import COMMANDS, SIZES
+from experiments.paper.scores import read
+from experiments.paper.sources import LOG, RunError, Sources
+from rp_jax import storage
+from rp_jax.validate import one_of
+
+MODULES: tuple[ModuleType, ...] = (
+    *(fig2, fig3, fig4, fig5, fig6, table1, table2, tables3_4, timing, theorems),
+    *(training_crashes, paper_recipe, thresholds, crowds, second_reward, ablations, walls),
+)
+RESULTS: dict[str, Any] = {module.__name__.rpartition(".")[2]: module for module in MODULES}
+NAME = "experiments.all"
+
+
+@dataclass(frozen=True)
+class Config:
+    """What is made."""
+
+    preset: str | None = None  # quick (the default) or full
+    only: tuple[str, ...] = ()  # results, or runs that they are taken from; default: all results
+    out: Path | None = None  # folder for results; default: results/paper-PRESET-TIME
+    resume: Path | None = None  # folder to go on in; the preset is the one that it was begun with
+
+
+def begun(config: Config) -> tuple[str, Path]:
+    """(preset, folder), of a new folder or of one to go on in.
+
+    Raises:
+        ValueError: a setting is out of range, or the folder cannot be used.
+    """
+    for name in config.only:
+        one_of("only", name, [*RESULTS, *COMMANDS])
+    cli.needs_matplotlib(True)
+    if config.resume is None:
+        preset = one_of("preset", config.preset or "quick", SIZES)
+        folder = storage.new_folder(config.out or pipeline.default_out("paper", preset))
+        plain = {"experiment": NAME, "preset": preset, **settings.machine()}
+        storage.write_json(folder / "config.json", plain)
+        return preset, folder
+    if config.preset or config.out:
+        raise ValueError(f"resume is {config.resume}; only --only may be given with it")
+    found = settings.read(config.resume)
+    if found.get("experiment") != NAME:
+        raise ValueError(f"resume is {config.resume}; it must be a folder of {NAME}")
+    return one_of("preset", str(found.get("preset")), SIZES), config.resume
+
+
+def make(names: Sequence[str], sources: Sources, folder: Path) -> dict[str, str]:
+    """Makes results and runs, one after another; returns what failed, and why."""
+    failed = {}
+    for name in names:
+        console.say(f"== {name}", style="bold")
+        try:
+            if name in RESULTS:
+                result(RESULTS[name], sources, folder / name)
+            else:
+                sources(name)
+        except RunError as error:
+            failed[name] = str(error)
+        except Exception as error:  # whatever it is, the others are not to suffer
+            traceback.print_exc()
+            failed[name] = f"{type(error).__name__}: {error}"
+        jax.clear_caches()
+        gc.collect()
+    return failed
+
+
+def result(module: Any, sources: Sources, folder: Path) -> None:
+    """Makes one result, unless it is saved already; draws its figures, and lets it tell."""
+    saved = folder / "results.json"
+    if not saved.exists():
+        folder.mkdir(exist_ok=True)
+        storage.write_json(saved, module.run(sources, folder))
+    if hasattr(module, "plot"):
+        module.plot(read(saved), folder)
+    for name in module.tell(read(saved)).figures:
+        if not (folder / name).exists():
+            raise FileNotFoundError(f"{folder / name}: it was not drawn")
+
+
+def blocks(folder: Path, preset: str, failed: dict[str, str]) -> list[report.Block]:
+    """The report on all results that are saved in the folder."""
+    found = {name: folder / name / "results.json" for name in RESULTS if name not in failed}
+    told = {name: RESULTS[name].tell(read(p)) for name, p in found.items() if p.exists()}
+    claims = [claim for section in told.values() for claim in section.claims]
+    counts = Counter(claim.verdict.partition(" (")[0] for claim in claims)
+    missing = [name for name in RESULTS if name not in told and name not in failed]
+    machine = settings.machine()
+    versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
+    out: list[report.Block] = [
+        report.Heading("The paper's figures and tables, and more", 1),
+        f"Preset {preset}; report by {versions}, {os.cpu_count()} cores, {machine['device']}. "
+        "Crash rates have exact 95 % intervals (Clopper-Pearson); returns, Student's over seeds, "
+        "or over episodes where there is one seed.",
+        f"{len(claims)} published claims: "
+        + "; ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
+        + ". A return has exceeded the published one if its whole interval lies above, and "
+        "reproduces it if the interval reaches it; a crash rate reproduces the published one, "
+        "which has two digits, if its whole interval does not exceed it as rounded.",
+        report.verdicts(claims, "All verdicts"),
+    ]
+    for name, section in told.items():
+        out += report.section(name, RESULTS[name].TITLE, section)
+    if missing:
+        out += [report.Heading("Not made yet"), ", ".join(missing)]
+    if failed:
+        out += [report.Heading("Failed"), *(f"{name}: {why}" for name, why in failed.items())]
+    lines = ledger(folder / "runs")
+    hours, cpu = (sum(float(line[k]) for line in lines) / 60 for k in ("minutes", "CPU minutes"))
+    took = f"{len(lines)} runs took {hours:.1f} hours, {cpu:.1f} CPU hours."
+    return [*out, report.Heading("What was run"), took, report.Grid("Runs", lines)]
+
+
+def ledger(folder: Path) -> list[dict[str, Any]]:
+    """A line per run: command, commit, and what it took in all its processes."""
+    lines = []
+    for name in COMMANDS:
+        if (folder / name / LOG).exists():
+            log = read(folder / name / LOG)
+            lines.append(
+                {
+                    "run": name,
+                    "command": log[0]["command"],
+                    "commit": log[-1]["commit"],
+                    "CPU minutes": f"{sum(entry['cpu_seconds'] for entry in log) / 60:.1f}",
+                    "minutes": f"{sum(entry['seconds'] for entry in log) / 60:.1f}",
+                }
+            )
+    return lines
+
+
+def main(argv: Sequence[str] | None = None) -> Path:
+    """Exits with 1 if a result failed, with 2 on bad input, with 130 on Ctrl-C."""
+    config = tyro.cli(Config, prog=f"python -m {NAME}", description=__doc__, args=argv)
+    with cli.bad_input():
+        preset, folder = begun(config)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # ends the running process too
+    sources = Sources(folder / "runs", preset)
+    try:
+        failed = make(config.only or tuple(RESULTS), sources, folder)
+    except KeyboardInterrupt:
+        console.say(f"to go on: python -m {NAME} --resume {folder}", style="yellow")
+        raise SystemExit(130) from None
+    report.write(folder, blocks(folder, preset, failed))
+    console.say(f"results: {folder / 'report.html'}")
+    for name, why in failed.items():
+        console.say(f"failed: {name}: {why}", style="red")
+    if failed:
+        raise SystemExit(1)
+    return folder
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+"""What is learned and played: one command line per run, in two sizes.
+
+A word that begins with @ is a file of another run, which is made first.
+"""
+
+COMMANDS: dict[str, str] = {
+    "frozen_lake": "frozen_lake --no-figures {frozen_lake}",
+    "theorems": "theorems --instances {instances}",
+    # RP, with the tuned recipe and the paper's baseline policy, and under plans.
+    "circuit": "circuit {seeds} {circuit_steps} {wall}",
+    "jam": "jam {seeds} {jam_steps} {wall} {obstacle} --test-obstacles 3 8 15 30 50",
+    "point_gather": "point_gather {seeds} {gather_steps} {bomb}",
+    "point_gather_x01": "point_gather {seeds} {gather_steps} --x 0.1 --threat @point_gather/threat"
+    " --no-figures",
+    "circuit_plans": "circuit {seeds} {circuit_steps} --baseline plans",
+    "jam_plans": "jam {seeds} {jam_steps} {obstacle} --baseline plans --x 0.001 --learning-toll 1"
+    " --learning-penalty 50 --test-obstacles 3 8 15 30 50",
+    # The paper's networks and settings, its threat functions included.
+    "circuit_paper": "circuit --recipe paper {episodes} {paper_steps} {paper_wall}",
+    "jam_paper": "jam --recipe paper {episodes} {paper_steps} {paper_wall} {paper_obstacle}",
+    # What RP is compared with.
+    "compare_circuit": "compare --env circuit --methods DQN CPO PID {compare_circuit}",
+    "compare_jam": "compare --env jam --methods DQN CPO PID {compare}",
+    "compare_point_gather": "compare --env point_gather --methods DQN CPO PID {compare}",
+    "mpc_circuit_3": "mpc --env circuit --horizon 3 {mpc}",
+    "mpc_circuit_4": "mpc --env circuit --horizon 4 {mpc}",
+    "mpc_jam_2": "mpc --env jam --horizon 2 {mpc}",
+    "mpc_jam_3": "mpc --env jam --horizon 3 {mpc}",
+    "mpc_point_gather_1": "mpc --env point_gather --horizon 1 {mpc}",
+    "mpc_point_gather_2": "mpc --env point_gather --horizon 2 {mpc}",
+    # Beyond the paper.
+    "frontier": "frontier {few} {jam_steps} --threat @jam_plans/threat",
+    "patrol": "patrol {few} {jam_steps} --threat @jam/threat",
+    # One switch each, against `jam`.
+    "unmasked": "jam {few} {jam_steps} --threat @jam/threat --planning.learner.no-masked-target"
+    " --no-figures",
+    "plans": "jam {few} {jam_steps} {obstacle} --baseline plans --no-figures",
+    "sampled_walls": "jam {few} {jam_steps} {wall} {obstacle} --wall.no-exact --no-figures",
+    "few_states": "jam {few} {jam_steps} {wall} {obstacle} {few_states} --no-figures",
+    "uniform": "jam {few} {jam_steps} {wall} {obstacle} --obstacle.sampling uniform --no-figures",
+    "horizon_5": "jam {few} {jam_steps} {wall} {obstacle} --obstacle-horizon 5 --no-figures",
+    "horizon_12": "jam {few} {jam_steps} {wall} {obstacle} --obstacle-horizon 12 --no-figures",
+}
+
+_FIT = "--{0}.fit.steps 2000 --{0}.test-states 500 --{0}.test-paths 1024"
+SIZES: dict[str, dict[str, str]] = {
+    "full": {
+        "frozen_lake": "",
+        "instances": "200000",
+        "seeds": "--preset full --episodes 10000",
+        "few": "--preset full --seeds 3 --episodes 4000",
+        "episodes": "--preset full --episodes 10000",
+        "circuit_steps": "",
+        "jam_steps": "",
+        "gather_steps": "",
+        "paper_steps": "",
+        "wall": "",
+        "obstacle": "",
+        "bomb": "",
+        "paper_wall": "",
+        "paper_obstacle": "",
+        "few_states": "--obstacle.states 20000 --obstacle.paths 640",
+        "compare": "--seeds 10 --steps 1200000 --episodes 2000",
+        "compare_circuit": "--seeds 10 --steps 1800000 --episodes 2000",
+        "mpc": "--episodes 1000",
+    },
+    "quick": {
+        "frozen_lake": "--horizons 100 --no-program",
+        "instances": "2000",
+        "seeds": "--episodes 1000",
+        "few": "--episodes 1000",
+        "episodes": "--episodes 1000",
+        "circuit_steps": "--planning.steps 200000",
+        "jam_steps": "--planning.steps 200000",
+        "gather_steps": "--planning.steps 200000",
+        "paper_steps": "--planning.steps 20000",
+        "wall": "--wall.states 20000 " + _FIT.format("wall"),
+        "obstacle": "--obstacle.states 20000 " + _FIT.format("obstacle"),
+        "bomb": "--bomb.states 20000 " + _FIT.format("bomb"),
+        "paper_wall": "--wall.states 20000 " + _FIT.format("wall"),
+        "paper_obstacle": "--obstacle.states 5000 " + _FIT.format("obstacle"),
+        "few_states": "--obstacle.states 2000 --obstacle.paths 640",
+        "compare": "--steps 200000 --episodes 1000",
+        "compare_circuit": "--steps 200000 --episodes 1000",
+        "mpc": "--episodes 50",
+    },
+}
+
+
+def words(name: str, preset: str) -> list[str]:
+    """The command line of a run, without the folder for its results."""
+    return COMMANDS[name].format(**SIZES[preset]).split()

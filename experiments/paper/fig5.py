@@ -1,0 +1,172 @@
+"""Figure 5: return and crash rate against steps, on Point Gather, Circuit and Jam."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+from experiments import tables
+from experiments.paper import published, scores
+from experiments.paper.section import Claim, Section, Table, holds
+
+TITLE = "Figure 5: learning curves"
+# The variant that is learned on, runs of RP, steps of MPC.
+TASKS: dict[str, tuple[str, tuple[str, ...], tuple[int, ...]]] = {
+    "point_gather": ("8 bombs", ("point_gather", "point_gather_x01"), (1, 2)),
+    "circuit": ("default", ("circuit",), (3, 4)),
+    "jam": ("N=8", ("jam",), (2, 3)),
+}
+ALMOST = 80  # per cent
+COMPETITIVE = 0.9  # of the best return that keeps c
+LEARNERS = ("dqn", "cpo", "pid")  # folders inside a comparison
+KEPT = ("method", "seed", "steps", "episodes", "return_mean", "crashes")
+
+
+def run(sources: Any, folder: Path) -> dict[str, Any]:
+    """By task, rows per chunk, method and seed; rows of MPC; what RP and others end with."""
+    found: dict[str, Any] = {}
+    for env, (variant, runs, searches) in TASKS.items():
+        compared = sources(f"compare_{env}")
+        files = [sources(name) / "metrics.jsonl" for name in runs]
+        files += [compared / name / "metrics.jsonl" for name in LEARNERS]
+        history = [row for file in files for row in scores.read_lines(file)]
+        rows = [row for name in runs for row in scores.read(sources(name) / "table.json")]
+        rows += scores.read(compared / "compare.json")
+        files = [sources(f"mpc_{env}_{steps}") / "table.json" for steps in searches]
+        levels = [row for file in files for row in scores.read(file)]
+        found[env] = {
+            "history": [{key: row[key] for key in KEPT} for row in history],
+            "evaluated": [row for row in rows if row["variant"] == variant],
+            "levels": [row for row in levels if row["variant"] == variant],
+        }
+    gather = sources("point_gather")
+    shutil.copyfile(gather / "animation.gif", folder / "animation.gif")
+    shutil.copyfile(gather / "figures" / "trajectories.png", folder / "trajectories.png")
+    return found
+
+
+def plot(results: dict[str, Any], folder: Path) -> None:
+    """A column per task."""
+    from rp_jax.plot import curves
+
+    panels = {env: of["history"] for env, of in results.items()}
+    levels = {env: of["levels"] for env, of in results.items()}
+    curves.methods(panels, folder / "figure_5.png", levels)
+
+
+def tell(results: dict[str, Any]) -> Section:
+    """The claims of section 5.3."""
+    seeds = {row["seed"] for row in results["jam"]["history"]}
+    learned = []
+    for env, of in results.items():
+        for row in scores.summed_up(of["evaluated"] + of["levels"]):
+            learned.append(
+                {
+                    "task": env,
+                    "method": row["method"],
+                    "seeds": row["seeds"],
+                    "return": f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}",
+                    "crashes": f"{row['crashes']:,} of {row['episodes']:,}",
+                    "crash rate, % [95 %]": tables.percent(row),
+                }
+            )
+    claims = [claim for env in ("circuit", "jam") for claim in _ahead(results[env], env)]
+    return Section(
+        f"{len(seeds)} seed(s); lines are means over seeds, bands 90 % intervals. Curves show the "
+        "agents as they explore; the table, the learned agents. MPC does not learn.",
+        tables=[Table("After learning, on the task that was learned", learned)],
+        claims=[*claims, *_gather(results["point_gather"])],
+        figures={
+            "figure_5.png": "Return and crash rate against agent steps.",
+            "trajectories.png": "Point Gather, x = .5: six rooms; apples green, bombs red.",
+            "animation.gif": "Point Gather, x = .5: an episode, and the threat of each action.",
+        },
+    )
+
+
+def _by_step(history: list[dict], method: str) -> list[tuple[int, float, float]]:
+    """(steps, mean return, crash rate) of each chunk in which episodes ended."""
+    of = [row for row in history if row["method"] == method and row["episodes"]]
+    found = []
+    for steps in sorted({row["steps"] for row in of}):
+        group = [row for row in of if row["steps"] == steps]
+        returns = sum(row["return_mean"] for row in group) / len(group)
+        crashes, episodes = (sum(row[k] for row in group) for k in ("crashes", "episodes"))
+        found.append((steps, returns, crashes / episodes))
+    return found
+
+
+def _ahead(of: dict[str, Any], env: str) -> list[Claim]:
+    """The highest return and the lowest crash rate in almost all phases; safer than MPC."""
+    methods = list(dict.fromkeys(row["method"] for row in of["history"]))
+    (rp,), others = ([m for m in methods if m.startswith("RP") == own] for own in (True, False))
+    curves = {method: _by_step(of["history"], method) for method in methods}
+    ahead, safer = [], []
+    for steps, earned, rate in curves[rp]:
+        rivals = [[p for p in curves[m] if p[0] <= steps] for m in others]
+        latest = [points[-1] for points in rivals if points]
+        ahead.append(all(earned >= point[1] for point in latest))
+        safer.append(all(rate <= point[2] for point in latest))
+    final = {row["method"]: row for row in scores.summed_up(of["evaluated"] + of["levels"])}
+    three = next((row for name, row in final.items() if name == "MPC (3 steps)"), None)
+    highest, lowest = (100 * sum(found) / len(found) for found in (ahead, safer))
+    claims = [
+        Claim(
+            f"Figure 5, {env}: the highest return in almost all phases of training",
+            f"almost all ({ALMOST} %)",
+            f"{highest:.0f} % of {len(ahead)} points",
+            holds(highest >= ALMOST),
+        ),
+        Claim(
+            f"Figure 5, {env}: the lowest crash rate, in almost all phases",
+            f"lowest ({ALMOST} %)",
+            f"{lowest:.0f} % of {len(safer)} points",
+            holds(lowest >= ALMOST),
+        ),
+    ]
+    if three is not None:
+        claims.append(
+            Claim(
+                f"Section 5.3, {env}: safer than 3-step MPC",
+                "lower crash rate",
+                f"RP {tables.percent(final[rp])} %, MPC {tables.percent(three)} %",
+                holds(final[rp]["crash_ci95"][1] < three["crash_ci95"][0]),
+            )
+        )
+    return claims
+
+
+def _gather(of: dict[str, Any]) -> list[Claim]:
+    """x = .1 earns less than DQN and CPO; x = .5 keeps up, and the constraint."""
+    final = {row["method"]: row for row in scores.summed_up(of["evaluated"])}
+    danger = {
+        method: [row["danger_mean"] for row in of["evaluated"] if row["method"] == method]
+        for method in final
+    }
+    wide, narrow = final["RP (x=0.5)"], final["RP (x=0.1)"]
+    limit = published.LIMITS["point_gather"]
+    within = [m for m in final if sum(danger[m]) / len(danger[m]) <= limit and m[:2] != "RP"]
+    rivals = [row for m, row in final.items() if m.startswith(("DQN", "CPO"))]
+    best = max(rivals, key=lambda row: row["return_mean"])
+    safest = max((final[m] for m in within), key=lambda row: row["return_mean"], default=None)
+    mean = sum(danger["RP (x=0.5)"]) / len(danger["RP (x=0.5)"])
+    rival = f"; best that keeps c: {safest['return_mean']:.2f}" if safest else "; no other keeps c"
+    return [
+        Claim(
+            "Section 5.3, point_gather: x = .1 earns less than penalised DQN and CPO",
+            "less",
+            f"RP {narrow['return_mean']:.2f} +- {narrow['return_ci95']:.2f}; best of them "
+            f"{best['return_mean']:.2f} ({best['method']})",
+            holds(narrow["return_mean"] < best["return_mean"]),
+        ),
+        Claim(
+            "Section 5.3, point_gather: x = .5 is competitive and keeps c = .1, from the same "
+            "threat function",
+            f"competitive ({100 * COMPETITIVE:.0f} % of the best that keeps c), danger below .1",
+            f"return {wide['return_mean']:.2f} +- {wide['return_ci95']:.2f}, bombs an episode "
+            f"{mean:.4f}{rival}",
+            holds(
+                mean <= limit
+                and (safest is None or wide["return_mean"] >= COMPETITIVE * safest["return_mean"])
+            ),
+        ),
+    ]

@@ -1,0 +1,217 @@
+"""Returns and crash rates of all methods on the variants of a task, beside published ones."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from scipy import stats
+
+from experiments import tables
+from experiments.paper import published
+from experiments.paper.section import Claim, Section, Table, holds, verdict_on
+
+Row = dict[str, Any]
+RP, PLANS = "RP", "RP, plans"
+
+
+def read(path: Path) -> Any:
+    """A JSON file."""
+    return json.loads(path.read_text())
+
+
+def read_lines(path: Path) -> list[Row]:
+    """A file with a JSON object per line."""
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def named(rows: Sequence[Row], method: str) -> list[Row]:
+    """The same rows, all of one method."""
+    return [{**row, "method": method} for row in rows]
+
+
+def collect(sources: Any, env: str, searches: Sequence[int]) -> list[Row]:
+    """One row per method, variant and seed: RP, the methods compared with, MPC."""
+    rows = named(read(sources(env) / "table.json"), RP)
+    rows += named(read(sources(f"{env}_plans") / "table.json"), PLANS)
+    rows += read(sources(f"compare_{env}") / "compare.json")
+    for steps in searches:
+        rows += read(sources(f"mpc_{env}_{steps}") / "table.json")
+    return rows
+
+
+def repenalised(row: Row, more: float) -> Row:
+    """The same episodes with `more` taken off per crash; an episode has one crash at most.
+
+    The variance follows from that of the returns and the mean return of those without a crash.
+    """
+    n, p, mean = row["episodes"], row["crash_rate"], row["return_mean"]
+    quantile = float(stats.t.ppf(0.975, n - 1))
+    variance = n * (row["return_ci95"] / quantile) ** 2
+    covariance = (1 - p) * (mean - row["uncrashed_return_mean"]) if p < 1 else 0.0
+    variance += (more**2 * p * (1 - p) - 2 * more * covariance) * n / (n - 1)
+    width = quantile * math.sqrt(max(variance, 0.0) / n)
+    return {**row, "return_mean": mean - more * p, "return_ci95": width}
+
+
+def summed_up(rows: Sequence[Row]) -> list[Row]:
+    """One row per method and variant, over the seeds."""
+    found = []
+    for method in dict.fromkeys(row["method"] for row in rows):
+        of = [row for row in rows if row["method"] == method]
+        found += [{"method": method, **row} for row in tables.over_seeds(of)]
+    return found
+
+
+def shown(row: Row) -> str:
+    """Return and crash rate in words."""
+    return (
+        f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}; "
+        f"{row['crashes']:,} of {row['episodes']:,}: {tables.percent(row)} %"
+    )
+
+
+def table(
+    title: str, scores: Sequence[Row], paper: Mapping[str, Mapping[str, published.Score]]
+) -> Table:
+    """Ours and the paper's (if there are any), a line per variant and method."""
+    lines = []
+    for variant in dict.fromkeys(row["variant"] for row in scores):
+        for row in scores:
+            if row["variant"] != variant:
+                continue
+            line = {
+                "variant": variant,
+                "method": row["method"],
+                "seeds": row["seeds"],
+                "return": f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}",
+                "crashes": f"{row['crashes']:,} of {row['episodes']:,}",
+                "crash rate, % [95 %]": tables.percent(row),
+            }
+            if paper:
+                known = paper.get(variant, {}).get(_plain(row["method"]))
+                line["paper: return (rate)"] = f"{known[0]:g} ({known[1]:g})" if known else ""
+            lines.append(line)
+    return Table(title, lines)
+
+
+def released(env: str) -> Table:
+    """The paper's released agents, played again."""
+    lines = [
+        {"variant": variant, "method": method, "return; crashes [95 %]": found}
+        for variant, of in published.RELEASED[env].items()
+        for method, found in of.items()
+    ]
+    return Table("The paper's released agents, played again", lines)
+
+
+def _plain(method: str) -> str:
+    return "RP" if method.startswith("RP") else method
+
+
+def plot(rows: Sequence[Row], env: str, path: Path) -> None:
+    """All methods' returns and crash rates, with the published ones."""
+    from rp_jax.plot import curves
+
+    curves.scores(summed_up(rows), published.SCORES[env], path)
+
+
+def tell(rows: Sequence[Row], env: str, where: str) -> Section:
+    """A published table and ours."""
+    found, paper = summed_up(rows), published.SCORES[env]
+    return Section(
+        "Returns are over all episodes, the penalty per crash included. RP: the paper's baseline "
+        "policy; RP, plans: plans that brake and evade. Diamonds: the paper.",
+        tables=[table(where, found, paper), goals(found, env), released(env)],
+        claims=entries(found, paper, where) + comparisons(found, paper, where),
+        figures={"scores.png": "Returns and crash rates with 95 % intervals."},
+    )
+
+
+def entries(
+    scores: Sequence[Row], paper: Mapping[str, Mapping[str, published.Score]], where: str
+) -> list[Claim]:
+    """On each published entry of RP, by each kind of RP."""
+    found = []
+    for row in scores:
+        known = paper.get(row["variant"], {}).get("RP")
+        if known and row["method"].startswith("RP"):
+            claim = f"{where}, {row['variant']}: {row['method']}"
+            said = f"{known[0]:g} ({known[1]:g})"
+            found.append(Claim(claim, said, shown(row), verdict_on(row, known)))
+    return found
+
+
+def comparisons(
+    scores: Sequence[Row], paper: Mapping[str, Mapping[str, published.Score]], where: str
+) -> list[Claim]:
+    """RP is safer than each other method everywhere; penalised DQN fails where it did not learn."""
+    rp = {row["variant"]: row for row in scores if row["method"] == RP}
+    found = []
+    for kind in ("DQN", "MPC"):
+        others = [  # where it is so in the paper
+            row
+            for row in scores
+            if row["method"].startswith(kind)
+            and paper[row["variant"]].get(row["method"], (0.0, 0.0))[1]
+            > paper[row["variant"]]["RP"][1]
+        ]
+        if not others:
+            continue
+        safer = [row["crash_ci95"][0] > rp[row["variant"]]["crash_ci95"][1] for row in others]
+        least = min(others, key=lambda row: row["crash_rate"])
+        found.append(
+            Claim(
+                f"{where}: RP is safer than {kind}",
+                "lower crash rate",
+                f"below {sum(safer)} of {len(safer)} {kind} entries, intervals apart; the lowest: "
+                f"{least['method']}, {least['variant']}: {tables.percent(least)} %",
+                holds(all(safer)),
+            )
+        )
+        if kind == "DQN":
+            less = [row for row in others if row["return_mean"] < rp[row["variant"]]["return_mean"]]
+            best = max(others, key=lambda r: r["return_mean"] - rp[r["variant"]]["return_mean"])
+            found.append(
+                Claim(
+                    f"{where}: RP earns more than DQN",
+                    "higher return",
+                    f"more than {len(less)} of {len(others)} DQN entries; the nearest: "
+                    f"{best['method']}, {best['variant']}: {best['return_mean']:.2f}",
+                    holds(len(less) == len(others)),
+                )
+            )
+    return found
+
+
+def goals(scores: Sequence[Row], env: str) -> Table:
+    """What this project set itself: the paper's return, and a bound on the crash rate."""
+    lines = []
+    for row in scores:
+        variant = row["variant"]
+        if not row["method"].startswith("RP") or variant not in published.GOALS[env]:
+            continue
+        bound, wanted = published.GOALS[env][variant], published.SCORES[env][variant]["RP"][0]
+        upper, mean = row["crash_upper95"], row["return_mean"]
+        lines.append(
+            {
+                "variant": variant,
+                "method": row["method"],
+                "return, at least": f"{wanted:g}",
+                "reached": f"{mean:.2f}",
+                "crash bound, below %": f"{100 * bound:g}",
+                "reached, %": f"{100 * upper:.3f}",
+                "met": _met(mean - wanted, bound - upper),
+            }
+        )
+    return Table("Goals: return, and one-sided 95 % upper bound of the crash rate", lines)
+
+
+def _met(more_return: float, less_crashes: float) -> str:
+    missed = []
+    if more_return < 0:
+        missed.append(f"return by {-more_return:.2f}")
+    if less_crashes <= 0:
+        missed.append(f"crash bound by {-100 * less_crashes:.3f} %")
+    return "missed: " + ", ".join(missed) if missed else "yes"

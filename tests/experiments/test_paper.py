@@ -1,0 +1,212 @@
+"""Results of the paper from run folders that are made up: numbers, figures, verdicts."""
+
+import dataclasses
+import importlib
+import itertools
+import json
+
+import numpy as np
+import pytest
+import tyro
+from stubs import RP, Stub, evaluated
+from tiny import programs_of_a_moment  # noqa: F401
+
+from experiments import all as everything
+from experiments import compare, pipeline
+from experiments.paper import commands, fig5, published, scores, section, table1, tables3_4, walls
+from experiments.paper import training_crashes as crashes
+from experiments.runs import EXPERIMENTS
+from rp_jax import storage
+from rp_jax.evaluate import Episodes, summarise
+
+PLAIN = [
+    name for name in everything.RESULTS if name not in ("fig2", "fig3", "fig6", "timing", "walls")
+]
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory):
+    return Stub(tmp_path_factory.mktemp("runs"))
+
+
+def made(name, sources, folder):
+    """The results as they are read back from JSON."""
+    folder.mkdir(exist_ok=True)
+    storage.write_json(folder / "results.json", everything.RESULTS[name].run(sources, folder))
+    return json.loads((folder / "results.json").read_text())
+
+
+@pytest.mark.parametrize("name", PLAIN)
+def test_each_result_has_what_its_section_speaks_of(name, sources, tmp_path):
+    module = everything.RESULTS[name]
+    results = made(name, sources, tmp_path / name)
+    if hasattr(module, "plot"):
+        module.plot(results, tmp_path / name)
+    told = module.tell(results)
+    assert told.tables
+    for table in told.tables:
+        assert len({tuple(row) for row in table.rows}) == 1  # the same columns
+    pictures = {p.name for p in (tmp_path / name).iterdir()} - {"results.json"}
+    assert pictures == set(told.figures)
+    for claim in told.claims:
+        assert claim.verdict.partition(" (")[0] in (
+            *(section.EXCEEDED, section.REPRODUCED, section.MISSED),
+        )
+
+
+def test_a_table_has_all_methods_beside_the_published_ones(sources, tmp_path):
+    told = table1.tell(made("table1", sources, tmp_path / "table1"))
+    rows = {(row["variant"], row["method"]): row for row in told.tables[0].rows}
+    assert len(rows) == 3 * 8  # RP twice, three DQN, CPO, PID, MPC
+    assert rows["N=8", "RP"]["paper: return (rate)"] == "69.1 (0)"
+    assert rows["N=15", "MPC (3 steps)"]["paper: return (rate)"] == "36.6 (0.45)"
+    assert rows["N=8", "CPO"]["paper: return (rate)"] == ""
+    assert rows["N=8", "RP"]["crashes"] == "8 of 800"
+
+
+def test_crashes_while_learning_are_those_of_all_chunks_and_seeds(sources, tmp_path):
+    rows = made("training_crashes", sources, tmp_path / "training_crashes")
+    found = {(row["env"], row["method"]): row for row in rows}
+    assert set(found) == {
+        *((env, method) for env in RP for method in ("RP", "CPO", "PID-Lagrangian")),
+        *((env, "RP, plans") for env in ("circuit", "jam")),
+        *(("circuit", f"DQN (penalty {p})") for p in (0, 20, 200)),
+        *(("jam", f"DQN (penalty {p})") for p in (5, 50, 500)),
+        *(("point_gather", f"DQN (penalty {p})") for p in (1, 10, 50)),
+    }
+    assert (found["jam", "RP"]["crashes"], found["jam", "RP"]["episodes"]) == (2 * 3 * 2, 120)
+    verdicts = {claim.verdict for claim in crashes.tell(rows).claims}
+    assert verdicts == {section.MISSED}  # one in ten
+
+
+def test_the_curves_claims_look_at_every_chunk(sources, tmp_path):
+    told = fig5.tell(made("fig5", sources, tmp_path / "fig5"))
+    claims = {claim.claim: claim for claim in told.claims}
+    lowest = claims["Figure 5, jam: the lowest crash rate, in almost all phases"]
+    assert (lowest.ours, lowest.verdict) == ("100 % of 3 points", section.REPRODUCED)
+    highest = claims["Figure 5, jam: the highest return in almost all phases of training"]
+    assert highest.ours == "100 % of 3 points"  # level
+    safer = claims["Section 5.3, jam: safer than 3-step MPC"]
+    assert safer.verdict == section.MISSED  # level
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.02, 0.5, 1.0])
+def test_another_penalty_gives_what_it_would_have_given_at_once(rate):
+    row = evaluated("a", "b", 0, rate)
+    n = np.arange(400)
+    crashed = n < rate * 400
+    zeros = np.zeros(400, int)
+    rows = Episodes(
+        50.0 + (n % 7) - 20 * crashed,
+        crashed.astype(float),
+        zeros > 0,
+        zeros + 10,
+        zeros,
+        zeros,
+        {"wall": crashed},
+        zeros,
+        zeros,
+    )
+    expected, found = summarise(rows, 500.0), scores.repenalised(row, 450.0)
+    for name in ("return_mean", "return_ci95", "crash_rate"):
+        assert found[name] == pytest.approx(expected[name], rel=1e-6)
+
+
+def test_the_heavier_tables_of_the_paper_follow_from_the_lighter_ones():
+    for env, (_, _, penalty) in tables3_4.TABLES.items():
+        more = published.HEAVIER[env] - penalty
+        for variant, methods in published.SCORES[env].items():
+            for method, (earned, rate) in methods.items():
+                heavy = published.HEAVIER_SCORES[env][variant][method]
+                assert heavy == (pytest.approx(earned - more * rate, abs=0.6), rate)
+
+
+@pytest.mark.parametrize(
+    ("mean", "width", "interval", "wanted", "verdict"),
+    [
+        (80, 1, (0, 0.004), (69.1, 0.0), "exceeded (return)"),
+        (69, 1, (0, 0.004), (69.1, 0.0), "reproduced"),
+        (69, 1, (0, 0.006), (69.1, 0.0), "not reproduced (crashes)"),
+        (60, 1, (0, 0.006), (69.1, 0.0), "not reproduced (return and crashes)"),
+        (33, 1, (0.01, 0.014), (33.0, 0.02), "exceeded (crashes)"),
+        (33, 1, (0.01, 0.016), (33.0, 0.02), "reproduced"),
+        (80, 1, (0.03, 0.04), (33.0, 0.02), "not reproduced (crashes)"),
+    ],
+)
+def test_verdicts_go_by_whole_intervals(mean, width, interval, wanted, verdict):
+    row = {"return_mean": mean, "return_ci95": width, "crash_ci95": interval}
+    assert section.verdict_on(row, wanted) == verdict
+
+
+def test_goals_are_met_or_missed_by_so_much():
+    rows = scores.summed_up(scores.named([evaluated("N=8", "", 0, 0.0, 80.0, 10_000)], "RP"))
+    (line,) = scores.goals(rows, "jam").rows
+    assert line["met"] == "yes"
+    rows[0] |= {"return_mean": 60.0, "crash_upper95": 0.003}
+    (line,) = scores.goals(rows, "jam").rows
+    assert line["met"] == "missed: return by 9.10, crash bound by 0.100 %"
+
+
+def parsed(name, preset):
+    """The configuration of a run, checked as its experiment does it."""
+    module_name, *rest = commands.words(name, preset)
+    module = importlib.import_module(f"experiments.{module_name}")
+    if not hasattr(module, "Config") or not issubclass(module.Config, pipeline.Config):
+        if module_name != "patrol":
+            config = tyro.cli(module.Config, args=rest)
+            if module_name == "compare":
+                compare.settings_of(config)
+            elif module_name == "mpc":
+                assert config.env in EXPERIMENTS
+            else:
+                config.validate()
+            return config
+        module = importlib.import_module("experiments.jam")
+    given = dict(itertools.pairwise(rest))
+    base = module.PRESETS[given.get("--preset", "quick")](given.get("--recipe", "tuned"))
+    for word in ("--preset", "--recipe"):
+        if word in rest:
+            at = rest.index(word)
+            del rest[at : at + 2]
+    config = tyro.cli(type(base), default=base, args=rest)
+    config.validate()
+    return config
+
+
+@pytest.mark.parametrize("preset", commands.SIZES)
+@pytest.mark.parametrize("name", commands.COMMANDS)
+def test_commands_are_understood(name, preset):
+    config = parsed(name, preset)
+    for word in commands.words(name, preset):
+        if word.startswith("@"):
+            assert word[1:].partition("/")[0] in commands.COMMANDS
+    if preset == "full" and name in ("jam", "circuit", "point_gather", "jam_plans"):
+        assert (config.seeds, config.episodes) == (10, 10_000)
+    if preset == "full" and name.startswith("compare"):
+        of = parsed(name.removeprefix("compare_"), preset)
+        assert (config.seeds, config.steps) == (10, of.planning.steps)  # as many as RP has
+
+
+def test_one_switch_differs_from_the_first_table():
+    reference = dataclasses.asdict(parsed("jam", "full"))
+    for name, switched in {
+        "unmasked": {"planning"},
+        "plans": {"baseline"},
+        "sampled_walls": {"wall"},
+        "few_states": {"obstacle"},
+        "uniform": {"obstacle"},
+        "horizon_5": {"obstacle_horizon"},
+        "horizon_12": {"obstacle_horizon"},
+    }.items():
+        changed = dataclasses.asdict(parsed(name, "full"))
+        found = {key for key, value in changed.items() if value != reference[key]}
+        assert found - {"seeds", "episodes", "threat", "test_obstacles", "figures"} == switched
+
+
+def test_sums_over_walls_are_compared_with_the_joint_threat():
+    joint = np.asarray([[0.0, 0.0005, 0.005, 1.0]])
+    found = walls.compared(np.asarray([[0.0, 0.002, 0.01, 1.5]]), joint, 0.001)
+    assert found["admissible"] == 0.25
+    assert found["secure"] == 1.0
+    assert found["below_joint"] == 0.0
+    assert found["ratios"] == [pytest.approx(4.0), pytest.approx(2.0), None, pytest.approx(1.5)]
