@@ -63,7 +63,11 @@ def learn(
         began = time.perf_counter()
         init = jax.jit(jax.vmap(functools.partial(learner.init, config=learning), (0, None)))
         state, c = init(pipeline.keys_of(members, pipeline.PLANNING), pmdp), jnp.float32(limit)
-        jitted = jax.jit(jax.vmap(chunk, (0, None, None)), donate_argnums=0)
+        jitted = jax.jit(
+            jax.vmap(chunk, (0, None, None)),
+            donate_argnums=0,
+            compiler_options=cpo.compiler_options(),
+        )
         improve = jitted.lower(state, pmdp, c).compile()
         compiled = now = time.perf_counter()
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import jaxlib
 from flax import linen as nn
 from jax import Array
 from jax.flatten_util import ravel_pytree
@@ -54,6 +55,16 @@ class Metrics(NamedTuple):
 
     rollout: actor_critic.Metrics
     update: Update
+
+
+def compiler_options() -> dict[str, str]:
+    """What to compile `step` or `improve` with, as `jax.jit(..., compiler_options=...)`.
+
+    On a CPU, jaxlib 0.10 fuses some products for YNNPACK wrongly: on large batches the conjugate
+    gradients come out as nan or worse, and the line search then accepts no step.
+    """
+    wrong = jax.default_backend() == "cpu" and jaxlib.__version__.startswith("0.10.")
+    return {"xla_cpu_experimental_ynn_fusion_type": ""} if wrong else {}
 
 
 def fisher_product(
@@ -124,7 +135,7 @@ def step_lengths(
 def improve(
     params: Any, network: nn.Module, batch: Batch, excess: Array, config: CPOConfig
 ) -> tuple[Any, Update]:
-    """One update of the policy (their Algorithm 1).
+    """One update of the policy (their Algorithm 1). To be compiled with `compiler_options`.
 
     Args:
         params: of the policy.
@@ -180,7 +191,7 @@ def init(key: Array, pmdp: PMDP, config: CPOConfig) -> State:
 
 
 def step(state: State, pmdp: PMDP, limit: Array, config: CPOConfig) -> tuple[State, Metrics]:
-    """Collects a batch, then improves policy and critic.
+    """Collects a batch, then improves policy and critic. To be compiled with `compiler_options`.
 
     Args:
         state: carried.

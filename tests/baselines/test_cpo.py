@@ -17,6 +17,7 @@ from rp_jax.baselines import cpo
 from rp_jax.baselines.actor_critic import DANGER, REWARD, Batch
 from rp_jax.baselines.cpo import CONSTRAINED, RECOVERY, UNCONSTRAINED, CPOConfig
 from rp_jax.baselines.policies import ACTORS
+from rp_jax.envs import jam
 from rp_jax.planning.pmdp import Encoded
 from rp_jax.tabular import oracle, threat
 
@@ -229,3 +230,25 @@ def test_bad_settings_are_named(change, field):
     CONFIG.validate("cpo")
     with pytest.raises(ValueError, match=rf"^cpo\.{field} is .*must"):
         dataclasses.replace(CONFIG, **change).validate("cpo")
+
+
+def test_a_batch_of_a_real_task_finds_a_step():
+    """As large as Jam's: compiled without these options, its products are wrong on a CPU."""
+    rng = np.random.default_rng(0)
+    rows = 6400
+    network = ACTORS["categorical"](num_actions=15, scale=jam.SCALE)
+    seen = Encoded(
+        jnp.asarray(rng.integers(0, 256, (rows, 45)), jnp.uint8),
+        jnp.asarray(rng.normal(size=(rows, 36)), jnp.float32),
+    )
+    advantage = jnp.asarray(rng.normal(size=(rows, 2)), jnp.float32)
+    batch = Batch(seen, jnp.asarray(rng.integers(0, 15, rows)), advantage, advantage)
+    params = jax.jit(network.init)(jax.random.key(0), seen)
+    update = jax.jit(
+        lambda params, batch: cpo.improve(params, network, batch, jnp.asarray(-1.0), CPOConfig())[
+            1
+        ],
+        compiler_options=cpo.compiler_options(),
+    )(params, batch)
+    assert update.accepted
+    assert 0.003 < update.kl <= 0.01
