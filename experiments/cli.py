@@ -107,6 +107,7 @@ def resumable(name: str, folder: Path, checkpoints: Checkpoints) -> Iterator[Non
     with ExitStack() as stack:
         with bad_input():
             stack.enter_context(storage.locked(folder, settings.LOCK))
+        storage.sweep(folder)
         try:
             yield
         except KeyboardInterrupt as stop:

@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 FORMAT = 2  # of the manifest
+PART = ".part"  # ends the names of files that are being written
 
 
 class StorageError(ValueError):
@@ -34,7 +35,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 def _write(path: Path, parts: Iterable[memoryview]) -> None:
     name = None
     try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        handle, name = tempfile.mkstemp(PART, f".{path.name}.", path.parent)
         with os.fdopen(handle, "wb") as file:
             for part in parts:
                 file.write(part)
@@ -50,6 +51,13 @@ def _write(path: Path, parts: Iterable[memoryview]) -> None:
         if isinstance(error, OSError):
             raise StorageError(f"{path}: cannot be written ({error.strerror})") from error
         raise
+
+
+def sweep(folder: Path) -> None:
+    """Removes what writes left that ended with their process; no other may be at work in it."""
+    for left in Path(folder).rglob(f".*{PART}"):
+        with contextlib.suppress(OSError):
+            left.unlink()
 
 
 def _sync(folder: Path) -> None:

@@ -1,6 +1,7 @@
 import errno
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -61,6 +62,24 @@ def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(tmp_path, mon
         storage.write_bytes(path, b"new")
     assert path.read_bytes() == b"old"
     assert names(tmp_path) == ["file"]
+
+
+def test_what_a_killed_write_left_is_swept_up(tmp_path):
+    """Killed between the data and the name."""
+    inner = tmp_path / "a"
+    inner.mkdir()
+    storage.write_bytes(inner / "file", b"old")
+    code = (
+        "import os, signal; from rp_jax import storage; "
+        "os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL); "
+        f"storage.write_bytes({str(inner / 'file')!r}, b'new')"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == -signal.SIGKILL
+    (inner / ".hidden").touch()
+    assert len(list(inner.iterdir())) == 3
+    storage.sweep(tmp_path)
+    assert {path.name for path in inner.iterdir()} == {"file", ".hidden"}
+    assert (inner / "file").read_bytes() == b"old"
 
 
 def test_data_is_on_disk_before_the_name_points_to_it(tmp_path, monkeypatch):

@@ -12,12 +12,7 @@ VARIANTS = ("N=30", "N=50")
 
 def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
     """A row per kind of RP, number of obstacles and seed."""
-    runs = {scores.RP: "jam", scores.PLANS: "jam_plans"}
-    rows = [
-        row
-        for method, name in runs.items()
-        for row in scores.named(scores.read(sources(name) / "table.json"), method)
-    ]
+    rows = scores.by_kind(sources, "jam")
     return [row for row in rows if row["variant"] in VARIANTS]
 
 

@@ -13,7 +13,12 @@ from experiments.paper import published
 from experiments.paper.section import Claim, Section, Table, holds, verdict_on
 
 Row = dict[str, Any]
-RP, PLANS = "RP", "RP, plans"
+RP, PLANS, AHEAD = "RP", "RP, plans", "RP, plans, one step ahead"
+RUNS = {  # of each kind of RP
+    "circuit": {RP: "circuit", PLANS: "circuit_plans"},
+    "jam": {RP: "jam", PLANS: "jam_plans", AHEAD: "jam_ahead"},
+    "point_gather": {RP: "point_gather"},
+}
 
 
 def read(path: Path) -> Any:
@@ -31,10 +36,18 @@ def named(rows: Sequence[Row], method: str) -> list[Row]:
     return [{**row, "method": method} for row in rows]
 
 
+def by_kind(sources: Any, env: str) -> list[Row]:
+    """One row per kind of RP, variant and seed."""
+    return [
+        row
+        for method, name in RUNS[env].items()
+        for row in named(read(sources(name) / "table.json"), method)
+    ]
+
+
 def collect(sources: Any, env: str, searches: Sequence[int]) -> list[Row]:
     """One row per method, variant and seed: RP, the methods compared with, MPC."""
-    rows = named(read(sources(env) / "table.json"), RP)
-    rows += named(read(sources(f"{env}_plans") / "table.json"), PLANS)
+    rows = by_kind(sources, env)
     rows += read(sources(f"compare_{env}") / "compare.json")
     for steps in searches:
         rows += read(sources(f"mpc_{env}_{steps}") / "table.json")
@@ -122,7 +135,8 @@ def tell(rows: Sequence[Row], env: str, where: str) -> Section:
     found, paper = summed_up(rows), published.SCORES[env]
     return Section(
         "Returns are over all episodes, the penalty per crash included. RP: the paper's baseline "
-        "policy; RP, plans: plans that brake and evade. Diamonds: the paper.",
+        "policy; RP, plans: plans that brake and evade; one step ahead: where no action is "
+        "admissible by the sum over obstacles. Diamonds: the paper.",
         tables=[table(where, found, paper), goals(found, env), released(env)],
         claims=entries(found, paper, where) + comparisons(found, paper, where),
         figures={"scores.png": "Returns and crash rates with 95 % intervals."},

@@ -10,17 +10,12 @@ from experiments.paper.section import Claim, Section, Table, holds
 from rp_jax import statistics
 
 TITLE = "Crashes while learning"
-RUNS = {
-    "circuit": {scores.RP: "circuit", scores.PLANS: "circuit_plans"},
-    "jam": {scores.RP: "jam", scores.PLANS: "jam_plans"},
-    "point_gather": {"RP": "point_gather"},
-}
 
 
 def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
     """A row per task and method: episodes and crashes of all seeds, exploration included."""
     rows = []
-    for env, own in RUNS.items():
+    for env, own in scores.RUNS.items():
         files = {method: sources(name) / "metrics.jsonl" for method, name in own.items()}
         histories = {method: scores.read_lines(file) for method, file in files.items()}
         compared = sources(f"compare_{env}")

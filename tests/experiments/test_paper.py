@@ -57,7 +57,7 @@ def test_each_result_has_what_its_section_speaks_of(name, sources, tmp_path):
 def test_a_table_has_all_methods_beside_the_published_ones(sources, tmp_path):
     told = table1.tell(made("table1", sources, tmp_path / "table1"))
     rows = {(row["variant"], row["method"]): row for row in told.tables[0].rows}
-    assert len(rows) == 3 * 8  # RP twice, three DQN, CPO, PID, MPC
+    assert len(rows) == 3 * 9  # RP three times, three DQN, CPO, PID, MPC
     assert rows["N=8", "RP"]["paper: return (rate)"] == "69.1 (0)"
     assert rows["N=15", "MPC (3 steps)"]["paper: return (rate)"] == "36.6 (0.45)"
     assert rows["N=8", "CPO"]["paper: return (rate)"] == ""
@@ -70,6 +70,7 @@ def test_crashes_while_learning_are_those_of_all_chunks_and_seeds(sources, tmp_p
     assert set(found) == {
         *((env, method) for env in RP for method in ("RP", "CPO", "PID-Lagrangian")),
         *((env, "RP, plans") for env in ("circuit", "jam")),
+        ("jam", "RP, plans, one step ahead"),
         *(("circuit", f"DQN (penalty {p})") for p in (0, 20, 200)),
         *(("jam", f"DQN (penalty {p})") for p in (5, 50, 500)),
         *(("point_gather", f"DQN (penalty {p})") for p in (1, 10, 50)),
