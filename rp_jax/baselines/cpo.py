@@ -17,6 +17,7 @@ from rp_jax.baselines.actor_critic import DANGER, REWARD, ActorCriticConfig, Bat
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import number
 
+ENOUGH = 1e-5  # residual of conjugate gradients, relative: beyond, rounding makes them 0 / 0
 TINY = 1e-12  # keeps quotients of what may vanish finite
 UNCONSTRAINED, CONSTRAINED, RECOVERY = range(3)  # how a step was chosen
 
@@ -163,7 +164,7 @@ def improve(
 
     g, b = jax.jacrev(surrogates)(theta)
     product = fisher_product(policy, theta, config.damping)
-    v, w = (cg(product, a, tol=0.0, maxiter=config.products)[0] for a in (g, b))
+    v, w = (cg(product, a, tol=ENOUGH, maxiter=config.products)[0] for a in (g, b))
     along, against, case = step_lengths(g @ v, g @ w, b @ w, excess, config.divergence)
     direction = along * v - against * w
 
