@@ -25,8 +25,7 @@ CONFIG = CPOConfig(rollout=ROLLOUT)
 TRACED = []
 
 init = jax.jit(cpo.init, static_argnums=2)
-OPTIONS = cpo.compiler_options()
-improve = jax.jit(cpo.improve, static_argnums=(1, 4), compiler_options=OPTIONS)
+improve = jax.jit(cpo.improve, static_argnums=(1, 4))
 
 
 @pytest.fixture
@@ -35,7 +34,7 @@ def compile_soon():
         yield
 
 
-@functools.partial(jax.jit, static_argnums=(3, 4), compiler_options=OPTIONS)
+@functools.partial(jax.jit, static_argnums=(3, 4))
 def learn(state, pmdp, limit, config, count):
     TRACED.append(config)
 
@@ -249,7 +248,7 @@ def test_a_batch_of_a_real_task_finds_a_step():
         lambda params, batch: cpo.improve(params, network, batch, jnp.asarray(-1.0), CPOConfig())[
             1
         ],
-        compiler_options=OPTIONS,
+        compiler_options=cpo.compiler_options(),
     )(params, batch)
     assert update.accepted
     assert 0.003 < update.kl <= 0.01
