@@ -6,7 +6,7 @@ from benchmarks.bound import Piece
 from benchmarks.measure import Row, measure
 from benchmarks.report import main
 from benchmarks.setups import more_chunks, pmdp_of, tasks
-from experiments import pipeline
+from experiments import pipeline, training
 from rp_jax.planning import loop
 
 ITERATIONS = 25
@@ -19,7 +19,7 @@ def run(counts: tuple[int, ...] = (1, 2, 4, 8, 16)) -> list[Row]:
     rows = []
     for count in counts:
         members = [
-            pipeline.Member(seed, config.x, config.learning_penalty) for seed in range(count)
+            training.Member(seed, config.x, config.learning_penalty) for seed in range(count)
         ]
         pmdp, axes = pipeline.side_by_side(one, members)
         init = jax.jit(jax.vmap(loop.init, (0, axes, None)), static_argnums=2)

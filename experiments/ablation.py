@@ -7,18 +7,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from experiments import cli, console, pipeline, tables
+from experiments import cli, console, pipeline, tables, training
 from rp_jax import evaluate, storage
 from rp_jax.checkpoints import Checkpoints
 
 RANDOM = 100  # stream of random numbers, apart from the pipeline's
 
 
-def members_of(config: pipeline.Config) -> list[pipeline.Member]:
+def members_of(config: pipeline.Config) -> list[training.Member]:
     """Of each seed: no shield; no shield, but danger penalised; the shield."""
     cases = [(float("inf"), 0.0), (float("inf"), config.penalty), (config.x, 0.0)]
     seeds = range(config.seed, config.seed + config.seeds)
-    return [pipeline.Member(seed, x, penalty) for x, penalty in cases for seed in seeds]
+    return [training.Member(seed, x, penalty) for x, penalty in cases for seed in seeds]
 
 
 def at_random(

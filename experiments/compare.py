@@ -16,7 +16,7 @@ from typing import Any
 
 import tyro
 
-from experiments import cli, console, mpc, pipeline, policy_gradient, tables
+from experiments import cli, console, mpc, pipeline, policy_gradient, tables, training
 from experiments.runs import EXPERIMENTS
 from experiments.settings import begin
 from rp_jax import storage
@@ -80,7 +80,7 @@ def by_q_learning(
     task: pipeline.Task,
     config: Any,
     models: dict | None,
-    members: Sequence[pipeline.Member],
+    members: Sequence[training.Member],
     folder: Path,
     checkpoints: Checkpoints,
 ) -> list[dict[str, Any]]:
@@ -90,24 +90,8 @@ def by_q_learning(
     return with_learning(rows, trained)
 
 
-def by_policy_gradient(
-    name: str,
-    learning: Any,
-    limit: float,
-    task: pipeline.Task,
-    config: Any,
-    folder: Path,
-    checkpoints: Checkpoints,
-) -> list[dict[str, Any]]:
-    """Rows of CPO or of PID-Lagrangian PPO; arguments as of `policy_gradient.learn`."""
-    trained = policy_gradient.learn(name, learning, limit, task, config, folder, checkpoints)
-    return with_learning(
-        policy_gradient.evaluate_all(name, learning, trained, task, config), trained
-    )
-
-
 def with_learning(
-    rows: Sequence[Mapping[str, Any]], trained: pipeline.Trained
+    rows: Sequence[Mapping[str, Any]], trained: training.Trained
 ) -> list[dict[str, Any]]:
     """Rows of evaluation with what their learners met while learning."""
     found = []
@@ -162,7 +146,9 @@ def run(
     for method, (name, learning) in on_policy.items():
         if method in config.methods:
             out, at = folder / method.lower(), checkpoints.at(method.lower())
-            add(by_policy_gradient(name, learning, limit, task, settings, out, at))
+            trained = policy_gradient.learn(name, learning, limit, task, settings, out, at)
+            found = policy_gradient.evaluate_all(name, learning, trained, task, settings)
+            add(with_learning(found, trained))
     if "MPC" in config.methods:
         add(by_search(config, horizon))
     return rows

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments import cli, console, jam, pipeline, tables
+from experiments import cli, console, jam, pipeline, tables, training
 from rp_jax import storage
 from rp_jax.checkpoints import Checkpoints
 from rp_jax.planning import conditioned
@@ -37,7 +37,7 @@ class Config(jam.Config):
             number("thresholds", x, above=0, most=1)
 
 
-def members_of(config: Config) -> list[pipeline.Member]:
+def members_of(config: Config) -> list[training.Member]:
     """One for each threshold and seed."""
     seeds = pipeline.members_of(config)
     return [member._replace(x=x) for x in config.thresholds for member in seeds]
@@ -45,7 +45,7 @@ def members_of(config: Config) -> list[pipeline.Member]:
 
 def told(
     task: pipeline.Task, config: Config, pmdp: Any
-) -> tuple[pipeline.Task, Any, list[pipeline.Member]]:
+) -> tuple[pipeline.Task, Any, list[training.Member]]:
     """The task, P-MDP and members of the planner that is told x.
 
     Its tests are those of the task at each threshold.

@@ -3,7 +3,6 @@
 import dataclasses
 import datetime
 import functools
-import json
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import rp_jax
-from experiments import console, tables
+from experiments import console, tables, training
+from experiments.training import Member, Trained
 from rp_jax import devices, evaluate, shield, storage
 from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
 from rp_jax.envs.base import BASELINES, Env
@@ -32,7 +32,6 @@ from rp_jax.validate import number, one_of
 
 # Streams of random numbers, apart.
 THREAT, SUMS, PLANNING, EVALUATION, STARTS, MEDIA, CERTIFICATE, RARE = range(8)
-CHUNKS = 30  # of a training run: points of its curves
 
 
 @dataclass(frozen=True)
@@ -83,23 +82,6 @@ class Task(NamedTuple):
     tests: dict[str, Any]  # by variant, environment parameters
     threats: dict[str, ThreatConfig]  # by kind of hazard
     draw: Callable[[Any], None] | None  # makes the task's own figures from a `Finished`
-
-
-class Member(NamedTuple):
-    """One of the training runs that go side by side."""
-
-    seed: int
-    x: float
-    learning_penalty: float
-
-
-class Trained(NamedTuple):
-    """What planning leaves."""
-
-    params: Any  # of the Q-networks, leading axis (members,)
-    history: list[dict[str, Any]]  # one row per chunk and member
-    seconds: float  # of all seeds together, without compilation
-    compile_seconds: float
 
 
 class Finished(NamedTuple):
@@ -247,13 +229,6 @@ def during(pmdp: PMDP, share: float, config: Config) -> PMDP:
     return pmdp.replace(penalty=begin + min(1.0, 2 * share) * (pmdp.penalty - begin))
 
 
-class Record(NamedTuple):
-    """What happened in each chunk of a training run."""
-
-    metrics: Any  # (chunks, members) sums, those of `planning.loop` or of an on-policy learner
-    seconds: np.ndarray  # (chunks,) since the beginning, interruptions left out
-
-
 def plan(
     task: Task,
     config: Config,
@@ -269,8 +244,7 @@ def plan(
     """
     planning = config.planning
     warm = -(-planning.replay_start // planning.num_envs)  # iterations before learning
-    length = -(-max(1, planning.iterations - warm) // CHUNKS)
-    chunks = -(-max(1, planning.iterations - warm) // length)
+    chunks, length = training.chunks_of(max(1, planning.iterations - warm))
     steps = (warm + chunks * length) * planning.num_envs
     keys = keys_of(members, PLANNING)
     names = [method_name(config, member) for member in members]
@@ -283,13 +257,12 @@ def plan(
     mesh = devices.mesh_of(config.devices)
     keys, pmdp = devices.place((keys, pmdp), (0, axes), mesh)
 
-    def history(record: Record, done: int) -> list[dict[str, Any]]:
-        rows = history_of(record, done, members, names, config.penalty)
-        for row, of in zip(rows, _each(record.metrics, done), strict=True):
-            row["insecure"] = of["insecure"] / of["steps"]
-            row["inadmissible"] = int(of["inadmissible"])
-            row["loss"] = of["loss"] / (length * planning.updates)
-        return rows
+    def more(sums: Mapping[str, float]) -> dict[str, Any]:
+        return {
+            "insecure": sums["insecure"] / sums["steps"],
+            "inadmissible": int(sums["inadmissible"]),
+            "loss": sums["loss"] / (length * planning.updates),
+        }
 
     with console.progress("planning") as bar:
         bar("", 0, chunks, "compiling")
@@ -303,99 +276,37 @@ def plan(
         # One program fills the replay and learns: its compilation takes longer than all else.
         chunk = jax.jit(devices.spread(onward, (0, axes, None, None), mesh), donate_argnums=0)
         shapes = devices.placed(jax.eval_shape(begin, keys, pmdp), mesh)
-        step = chunk.lower(shapes, pmdp, length, planning.updates).compile()
+        program = chunk.lower(shapes, pmdp, length, planning.updates).compile()
         first = begin.lower(keys, pmdp).compile()
-        compiled = now = time.perf_counter()
+        compiled = time.perf_counter()
 
-        def advance(i: int, carried: tuple[loop.LoopState, Record]):
-            nonlocal now
-            state, record = carried
-            state, new = step(state, during(pmdp, i / chunks, config), length, planning.updates)
-            for whole, part in zip(record.metrics, devices.gather(new, mesh), strict=True):
-                whole[i] += part
-            params = devices.gather(state.learner.params, mesh)
-            loop.check(params, jax.tree.map(lambda m: m[i], record.metrics))
-            now, before = time.perf_counter(), now
-            record.seconds[i] = record.seconds[i - 1] + now - before
-            rows = history(record, i + 1)
-            write_lines(folder / "metrics.jsonl", rows)
-            bar("", i + 1, chunks, note(rows[-len(members) :]))
-            return state, record
+        def step(i: int, state: loop.LoopState) -> tuple[loop.LoopState, Any]:
+            now = during(pmdp, i / chunks, config)
+            state, metrics = program(state, now, length, planning.updates)
+            return state, devices.gather(metrics, mesh)
 
-        state, metrics = step(first(keys, pmdp), during(pmdp, 0.0, config), planning.filling, 0)
-        metrics = devices.gather(metrics, mesh)
-        blank = jax.tree.map(lambda m: np.zeros((chunks, *m.shape), m.dtype), metrics)
-        for whole, part in zip(blank, metrics, strict=True):
+        def check(params: Any, metrics: Any) -> None:
+            loop.check(devices.gather(params, mesh), metrics)
+
+        state, filled = program(first(keys, pmdp), during(pmdp, 0.0, config), planning.filling, 0)
+        filled = devices.gather(filled, mesh)
+        metrics = jax.tree.map(lambda m: np.zeros((chunks, *m.shape), m.dtype), filled)
+        for whole, part in zip(metrics, filled, strict=True):
             whole[0] = part  # what filled the replay belongs to the first chunk
-        record = Record(blank, np.zeros(chunks, np.float32))
-        params, record = (checkpoints if mesh is None else NO_CHECKPOINTS).loop(
-            (state, record),
-            advance,
-            chunks,
-            lambda carried: (carried[0].learner.params, carried[1]),
+        params, rows, seconds = training.learn(
+            training.Learners(members, names, config.penalty, folder, more),
+            state,
+            metrics,
+            step,
+            check,
+            lambda state: state.learner.params,
+            bar,
+            checkpoints if mesh is None else NO_CHECKPOINTS,
         )
         params = devices.gather(params, mesh)
     about = {"methods": methods, "members": [member._asdict() for member in members]}
     storage.save(folder / "agent", "Q-network", params, about)
-    rows = history(record, chunks)
-    write_lines(folder / "metrics.jsonl", rows)
-    return Trained(params, rows, float(record.seconds[-1]), compiled - began)
-
-
-def history_of(
-    record: Record, done: int, members: Sequence[Member], names: Sequence[str], penalty: float
-) -> list[dict[str, Any]]:
-    """One row per chunk and member, of what all learners count.
-
-    Args:
-        record: of the run.
-        done: chunks that are over.
-        members: what learns side by side.
-        names: of their methods.
-        penalty: taken off the return per unit of danger.
-    """
-    rows = []
-    steps = np.cumsum(record.metrics.steps.astype(int), axis=0)
-    for k, of in enumerate(_each(record.metrics, done)):
-        chunk, i = divmod(k, len(members))
-        ended = max(of["episodes"], 1.0)
-        rows.append(
-            {
-                "seed": members[i].seed,
-                "method": names[i],
-                "steps": int(steps[chunk, i]),
-                "episodes": int(of["episodes"]),
-                "return_mean": (of["score"] - penalty * of["danger"]) / ended
-                if of["episodes"]
-                else float("nan"),
-                "crashes": int(of["crashes"]),
-                "goal_rate": of["goals"] / ended,
-                "seconds": float(record.seconds[chunk]),
-            }
-        )
-    return rows
-
-
-def _each(metrics: Any, done: int) -> list[dict[str, float]]:
-    """The sums of each chunk and member, in the order of rows."""
-    return [
-        {name: float(m[chunk, i]) for name, m in metrics._asdict().items()}
-        for chunk in range(done)
-        for i in range(metrics.steps.shape[1])
-    ]
-
-
-def note(rows: Sequence[Mapping]) -> str:
-    """Return and crashes of the last chunk, for the progress bar."""
-    returns = np.mean([row["return_mean"] for row in rows])
-    crashes, ended = sum(r["crashes"] for r in rows), sum(r["episodes"] for r in rows)
-    return f"return {returns:.1f}, {crashes} crashes in {ended} episodes"
-
-
-def write_lines(path: Path, rows: Sequence[Mapping]) -> None:
-    """The whole file each time: no line of it is ever half there, or there twice."""
-    plain = [{k: None if v != v else v for k, v in row.items()} for row in rows]
-    storage.write_bytes(path, "".join(json.dumps(row) + "\n" for row in plain).encode())
+    return Trained(params, rows, seconds, compiled - began)
 
 
 def evaluate_all(
@@ -537,7 +448,7 @@ def run(task: Task, config: Config, folder: Path, checkpoints: Checkpoints) -> N
     pmdp, members = make_pmdp(task, config, models, task.train), members_of(config)
     trained, rows = plan_and_evaluate(task, config, pmdp, members, folder, checkpoints)
     tables.write(folder, rows)
-    training = {
+    summary = {
         "steps": sum(row["steps"] for row in trained.history[-config.seeds :]),
         "crashes": sum(row["crashes"] for row in trained.history),
         "episodes": sum(row["episodes"] for row in trained.history),
@@ -550,10 +461,10 @@ def run(task: Task, config: Config, folder: Path, checkpoints: Checkpoints) -> N
             "total_before_figures": time.perf_counter() - began,
         },
     }
-    storage.write_json(folder / "training.json", training)
+    storage.write_json(folder / "training.json", summary)
     console.say(
-        f"training: {training['steps']:,} steps, {training['crashes']} crashes in "
-        f"{training['episodes']:,} episodes, {training['inadmissible']} inadmissible actions "
+        f"training: {summary['steps']:,} steps, {summary['crashes']} crashes in "
+        f"{summary['episodes']:,} episodes, {summary['inadmissible']} inadmissible actions "
         f"taken; {trained.seconds:.1f} s after {trained.compile_seconds:.1f} s of compilation"
     )
     if config.figures and task.draw is not None:

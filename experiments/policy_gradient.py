@@ -11,7 +11,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import console, pipeline
+from experiments import console, pipeline, training
 from rp_jax import evaluate
 from rp_jax.baselines import actor_critic, cpo, pid_lagrangian
 from rp_jax.checkpoints import Checkpoints
@@ -28,7 +28,7 @@ def learn(
     config: Any,
     folder: Path,
     checkpoints: Checkpoints,
-) -> pipeline.Trained:
+) -> training.Trained:
     """Trains all seeds as one program; writes metrics.jsonl as it goes.
 
     Args:
@@ -45,9 +45,7 @@ def learn(
     """
     learner, members = LEARNERS[name], pipeline.members_of(config)
     pmdp = pipeline.make_pmdp(task, config, None, task.train)
-    updates = -(-config.planning.steps // learning.rollout.steps)
-    length = -(-updates // pipeline.CHUNKS)
-    chunks = -(-updates // length)
+    chunks, length = training.chunks_of(-(-config.planning.steps // learning.rollout.steps))
     folder.mkdir(exist_ok=True)
 
     def chunk(state: Any, pmdp: Any, c: jax.Array) -> tuple[Any, actor_critic.Metrics]:
@@ -69,34 +67,23 @@ def learn(
             compiler_options=cpo.compiler_options(),
         )
         improve = jitted.lower(state, pmdp, c).compile()
-        compiled = now = time.perf_counter()
+        compiled = time.perf_counter()
 
-        def history(record: pipeline.Record, done: int) -> list[dict[str, Any]]:
-            names = [name] * len(members)
-            rows = pipeline.history_of(record, done, members, names, config.penalty)
-            pipeline.write_lines(folder / "metrics.jsonl", rows)
-            return rows
-
-        def advance(i: int, carried: tuple[Any, pipeline.Record]) -> tuple[Any, pipeline.Record]:
-            nonlocal now
-            state, record = carried
-            state, new = improve(state, pmdp, c)
-            for whole, part in zip(record.metrics, new, strict=True):
-                whole[i] = part
-            finite(f"{name}: weights", jax.flatten_util.ravel_pytree(weights(state))[0])
-            now, before = time.perf_counter(), now
-            record.seconds[i] = record.seconds[i - 1] + now - before
-            bar("", i + 1, chunks, pipeline.note(history(record, i + 1)[-len(members) :]))
-            return state, record
+        def check(params: Any, _: Any) -> None:
+            finite(f"{name}: weights", jax.flatten_util.ravel_pytree(params)[0])
 
         shapes = jax.eval_shape(jitted, state, pmdp, c)[1]
-        blank = jax.tree.map(lambda s: np.zeros((chunks, *s.shape), s.dtype), shapes)
-        record = pipeline.Record(blank, np.zeros(chunks, np.float32))
-        actors, record = checkpoints.loop(
-            (state, record), advance, chunks, lambda carried: (weights(carried[0]), carried[1])
+        params, rows, seconds = training.learn(
+            training.Learners(members, [name] * len(members), config.penalty, folder),
+            state,
+            jax.tree.map(lambda s: np.zeros((chunks, *s.shape), s.dtype), shapes),
+            lambda i, state: improve(state, pmdp, c),
+            check,
+            weights,
+            bar,
+            checkpoints,
         )
-    rows = history(record, chunks)
-    return pipeline.Trained(actors, rows, float(record.seconds[-1]), compiled - began)
+    return training.Trained(params, rows, seconds, compiled - began)
 
 
 def weights(state: Any) -> Any:
@@ -107,7 +94,7 @@ def weights(state: Any) -> Any:
 def evaluate_all(
     name: str,
     learning: Any,
-    trained: pipeline.Trained,
+    trained: training.Trained,
     task: pipeline.Task,
     config: Any,
 ) -> list[dict[str, Any]]:

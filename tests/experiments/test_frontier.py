@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tiny import TINY, TINY_THREAT, programs_of_a_moment  # noqa: F401
 
-from experiments import cli, frontier, jam, pipeline
+from experiments import cli, frontier, jam, training
 
 
 @pytest.fixture(scope="module")
@@ -44,10 +44,10 @@ def test_all_members_learn_and_none_acts_inadmissibly(results):
 def test_members_differ_in_threshold_and_seed_alone():
     config = dataclasses.replace(frontier.quick("tuned"), seeds=2, thresholds=(0.1, 0.2))
     assert frontier.members_of(config) == [
-        pipeline.Member(0, 0.1, 0.0),
-        pipeline.Member(1, 0.1, 0.0),
-        pipeline.Member(0, 0.2, 0.0),
-        pipeline.Member(1, 0.2, 0.0),
+        training.Member(0, 0.1, 0.0),
+        training.Member(1, 0.1, 0.0),
+        training.Member(0, 0.2, 0.0),
+        training.Member(1, 0.2, 0.0),
     ]
 
 

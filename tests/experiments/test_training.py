@@ -1,0 +1,76 @@
+"""Training runs in chunks, with a learner that only counts."""
+
+import json
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from experiments import console, training
+from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
+
+
+class Sums(NamedTuple):
+    steps: np.ndarray
+    episodes: np.ndarray
+    score: np.ndarray
+    danger: np.ndarray
+    crashes: np.ndarray
+    goals: np.ndarray
+
+
+MEMBERS = [training.Member(3, 0.1, 0.0), training.Member(4, 0.1, 0.0)]
+
+
+@pytest.mark.parametrize("units", [1, 7, 30, 31, 1000])
+def test_chunks_hold_all_units_and_few_more(units):
+    chunks, length = training.chunks_of(units)
+    assert chunks <= training.CHUNKS
+    assert units <= chunks * length < units + length
+
+
+def learn(folder, checkpoints=NO_CHECKPOINTS, chunks=4, fails_at=None):
+    """Member i has i episodes a chunk, each of 10 points and half a crash."""
+    each = np.asarray([0.0, 1.0], np.float32)
+    blank = Sums(*(np.zeros((chunks, 2), np.float32) for _ in Sums._fields))
+
+    def step(i, state):
+        return state + 1, Sums(each + 5, each, 10 * each, each / 2, each, 0 * each)
+
+    def check(weights, sums):
+        assert sums.steps.shape == (2,)
+        if weights == fails_at:
+            raise FloatingPointError(f"chunk {fails_at}")
+
+    learners = training.Learners(
+        MEMBERS, ["a", "b"], 4.0, folder, lambda sums: {"per step": sums["score"] / sums["steps"]}
+    )
+    with console.progress("counting") as bar:
+        state = np.asarray(0)
+        return training.learn(learners, state, blank, step, check, lambda s: s, bar, checkpoints)
+
+
+def test_each_chunk_and_member_has_a_row(tmp_path):
+    weights, rows, seconds = learn(tmp_path)
+    assert weights == 4
+    assert seconds >= 0
+    assert [(row["seed"], row["method"]) for row in rows] == 4 * [(3, "a"), (4, "b")]
+    assert [row["steps"] for row in rows[1::2]] == [6, 12, 18, 24]
+    assert all(row["return_mean"] == 10 - 4 * 0.5 for row in rows[1::2])
+    assert all(row["per step"] == pytest.approx(10 / 6) for row in rows[1::2])
+    written = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert written[1::2] == rows[1::2]
+    assert written[0]["return_mean"] is None  # no episode ended, and JSON knows no nan
+    assert np.isnan(rows[0]["return_mean"])
+
+
+def test_what_is_no_number_stops_it_and_it_goes_on_from_there(tmp_path, monkeypatch):
+    monkeypatch.setattr("rp_jax.checkpoints.INTERVAL", 0.0)
+    monkeypatch.setattr("rp_jax.checkpoints.SHARE", float("inf"))
+    checkpoints = Checkpoints(tmp_path / "checkpoints", say=lambda text: None)
+    with pytest.raises(FloatingPointError, match="chunk 3"):
+        learn(tmp_path, checkpoints, fails_at=3)
+    assert len((tmp_path / "metrics.jsonl").read_text().splitlines()) == 4
+    weights, rows, _ = learn(tmp_path, checkpoints)
+    assert (weights, len(rows)) == (4, 8)
+    assert rows[-1]["steps"] == 24
