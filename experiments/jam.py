@@ -21,6 +21,7 @@ class Config(pipeline.Config):
     """Settings of Jam."""
 
     obstacles: int = 8  # while learning
+    fewest_obstacles: int | None = None  # so many to `obstacles` in each episode of learning
     test_obstacles: tuple[int, ...] = (3, 8, 15)  # while testing
     obstacle_horizon: int = 8  # steps after which the threat of an obstacle is cut
     wall: ThreatConfig = field(default_factory=lambda: recipes.TUNED_WALL)  # threat of a wall point
@@ -53,9 +54,10 @@ def make_task(config: Config) -> pipeline.Task:
     if not config.test_obstacles:
         raise ValueError("test_obstacles is (); it must name at least one count")
 
-    def params(n: int) -> jam.Params:
+    def params(n: int, fewest: int | None = None) -> jam.Params:
         return jam.make_params(
             n,
+            fewest=fewest,
             obstacle_horizon=config.obstacle_horizon,
             fidelity=config.fidelity,
             baseline=config.baseline,
@@ -64,7 +66,7 @@ def make_task(config: Config) -> pipeline.Task:
     return pipeline.Task(
         name="jam",
         env=jam,
-        train=params(config.obstacles),
+        train=params(config.obstacles, config.fewest_obstacles),
         tests={f"N={n}": params(n) for n in config.test_obstacles},
         threats={"wall": config.wall, "obstacle": config.obstacle},
         draw=draw,

@@ -123,7 +123,8 @@ class TestConfigurations:
 
 ENVS = {
     circuit: "track time_limit radius horizon beta fidelity baseline",
-    jam: "num_obstacles time_limit radius beta wall_horizon obstacle_horizon fidelity baseline",
+    jam: "num_obstacles time_limit radius beta fewest wall_horizon obstacle_horizon fidelity "
+    "baseline",
     point_gather: "n_apples n_bombs time_limit horizon beta fidelity",
 }
 arguments = st.sampled_from(sorted(ENVS, key=lambda env: env.__name__)).flatmap(

@@ -40,6 +40,7 @@ SCALE: tuple[float, ...] = (1.0, 1.0, 1.0, 10.0) * (
 )  # of x, y, heading, speed, for learners
 UNSEEN = (-1.5, -1.51)  # where the observation puts obstacles that do not exist
 FIDELITIES = ("released", "paper")
+COUNT = 0xC0DE  # folded into the key of a start for the number of obstacles
 EVADING = 3  # steps for which plans drive on or back off before they brake
 
 
@@ -76,6 +77,7 @@ class Params(struct.PyTreeNode):
     stop_speed: Array  # () slower than this costs .05
     radius: Array  # () of every vehicle
     beta: Array  # () discount of danger
+    fewest: Array  # () int32, obstacles that an episode begins with, at least
     num_obstacles: int = struct.field(pytree_node=False, default=8)
     fidelity: str = struct.field(pytree_node=False, default="released")
 
@@ -97,6 +99,7 @@ def make_params(
     time_limit: int = 100,
     radius: float = 0.1,
     beta: float = 0.999,
+    fewest: int | None = None,
     wall_horizon: int = 5,
     obstacle_horizon: int = 8,
     fidelity: str = "released",
@@ -109,6 +112,8 @@ def make_params(
         time_limit: steps of an episode.
         radius: of every vehicle, room units.
         beta: discount of danger in the threat.
+        fewest: each episode begins with a number of obstacles drawn from `fewest` to
+            `num_obstacles`, so that a learner meets sparse rooms as well; by default with all.
         wall_horizon: steps after which the threat of a wall point is cut.
         obstacle_horizon: steps after which the threat of an obstacle is cut.
         fidelity: "released" rounds progress to whole points and relocates obstacles that leave
@@ -127,6 +132,8 @@ def make_params(
     room = int((ROOM / (2 * radius)) ** 2)  # how many fit, side by side
     number("num_obstacles", num_obstacles, least=1, most=room, integer=True)
     positive("beta", beta, most=1.0)
+    fewest = num_obstacles if fewest is None else fewest
+    number("fewest", fewest, least=0, most=num_obstacles, integer=True)
     positive("wall_horizon", wall_horizon, most=base.FARTHEST, integer=True)
     positive("obstacle_horizon", obstacle_horizon, most=100, integer=True)
     plans = baseline == "plans"
@@ -168,6 +175,7 @@ def make_params(
         stop_speed=jnp.asarray(0.005, float),
         radius=jnp.asarray(radius, float),
         beta=jnp.asarray(beta, float),
+        fewest=jnp.asarray(fewest, jnp.int32),
         num_obstacles=num_obstacles,
         fidelity=fidelity,
     )
@@ -224,7 +232,10 @@ def _appear(key: Array, agent: Vehicle, needed: Array, params: Params) -> Vehicl
 def reset(key: Array, params: Params) -> State:
     """The agent in its corner, the obstacles anywhere at least CLEARANCE away from it."""
     needed = jnp.ones(params.num_obstacles, bool)
-    return start_at(params.start, _appear(key, params.start, needed, params), params)
+    state = start_at(params.start, _appear(key, params.start, needed, params), params)
+    count_key = jax.random.fold_in(key, COUNT)
+    count = jax.random.randint(count_key, (), params.fewest, params.num_obstacles + 1)
+    return state.replace(present=jnp.arange(params.num_obstacles) < count)
 
 
 def _out_of_place(position: Array, params: Params) -> Array:

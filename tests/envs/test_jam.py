@@ -458,6 +458,8 @@ def test_the_walls_stand_around_the_room_but_not_in_the_exit(golden):
             {"radius": 0.5},
             r"^radius is 0\.5; it must be .* at least 0\.02, at most 0\.2",
         ),
+        ({"fewest": -1}, "^fewest is -1; it must be an integer, at least 0, at most 8"),
+        ({"fewest": 9}, "^fewest is 9; it must be an integer, at least 0, at most 8"),
         ({"beta": 0}, "^beta is 0; it must be a finite number, above 0, at most 1"),
         ({"wall_horizon": 0}, "^wall_horizon is 0; it must be an integer"),
         ({"obstacle_horizon": 0.5}, r"^obstacle_horizon is 0\.5; it must be an integer"),
@@ -466,6 +468,30 @@ def test_the_walls_stand_around_the_room_but_not_in_the_exit(golden):
 def test_parameters_out_of_range_are_named(settings, message):
     with pytest.raises(ValueError, match=message):
         jam.make_params(**settings)
+
+
+def test_episodes_begin_with_as_few_obstacles_as_is_asked_for():
+    start = jax.jit(jax.vmap(jam.reset, (0, None)))
+    row_keys = keys_of(1, 4000)
+    all_of_them = start(row_keys, params_of(8))
+    assert all_of_them.present.all()
+    some = start(row_keys, jam.make_params(8, fewest=2))
+    counts = np.bincount(some.present.sum(axis=1), minlength=9)
+    assert (counts[:2] == 0).all()
+    assert (np.abs(counts[2:] - 4000 / 7) < 5 * np.sqrt(4000 / 7)).all()
+    # The number alone differs.
+    jax.tree.map(np.testing.assert_array_equal, some.obstacles, all_of_them.obstacles)
+    assert (some.present[:, :-1] >= some.present[:, 1:]).all()  # the first ones
+
+
+def test_obstacles_that_are_absent_stay_away():
+    params = jam.make_params(8, fewest=0)
+    states = jax.device_get(drive(keys_of(2, 50), params, 40))
+    assert (states.present == states.present[0]).all()
+    assert 0 < states.present[0].mean() < 1
+    hit = jax.jit(jax.vmap(jax.vmap(jam.causes, (0, None)), (0, None)))
+    nobody = states.replace(present=np.zeros_like(states.present))
+    assert not hit(nobody, params)["obstacle"].any()
 
 
 def test_there_are_fifteen_actions_of_three_accelerations_and_five_turns():
