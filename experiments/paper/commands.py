@@ -16,7 +16,8 @@ COMMANDS: dict[str, str] = {
     "jam_plans": "jam {seeds} {jam_steps} {obstacle} --baseline plans --x 0.001 --learning-toll 1"
     " --learning-penalty 50 --test-obstacles 3 8 15 30 50",
     "jam_ahead": "jam {few} {jam_steps} --baseline plans --x 0.002 --lookahead 8 --learning-toll 1"
-    " --learning-penalty 50 --threat @jam_plans/threat --test-obstacles 3 8 15 30 50 --no-figures",
+    " --learning-penalty 50 --fewest-obstacles 0 --threat @jam_plans/threat"
+    " --test-obstacles 3 8 15 30 50 --no-figures",
     # The paper's networks and settings, its threat functions included.
     "circuit_paper": "circuit --recipe paper {episodes} {paper_steps} {paper_wall}",
     "jam_paper": "jam --recipe paper {episodes} {paper_steps} {paper_wall} {paper_obstacle}",
