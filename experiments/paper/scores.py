@@ -136,7 +136,8 @@ def tell(rows: Sequence[Row], env: str, where: str) -> Section:
     return Section(
         "Returns are over all episodes, the penalty per crash included. RP: the paper's baseline "
         "policy; RP, plans: plans that brake and evade; one step ahead: where no action is "
-        "admissible by the sum over obstacles. Diamonds: the paper.",
+        "admissible by the sum over obstacles, learned in Jam among 0 to 8 obstacles. Diamonds: "
+        "the paper.",
         tables=[table(where, found, paper), goals(found, env), released(env)],
         claims=entries(found, paper, where) + comparisons(found, paper, where),
         figures={"scores.png": "Returns and crash rates with 95 % intervals."},
