@@ -1,10 +1,12 @@
 """How a benchmark is taken: compile time apart, the median of repeats with their spread."""
 
 import dataclasses
+import multiprocessing
 import resource
 import statistics
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,8 +22,8 @@ class Row:
     name: str
     unit: str  # what `per_second` counts
     batch: int
-    per_second: float  # median
-    slowest: float
+    per_second: float  # median over calls, then over processes
+    slowest: float  # of the processes; of the calls, if there was one process
     fastest: float
     compile_seconds: float
     peak_mib: float  # of the process so far
@@ -83,6 +85,34 @@ def measure(
         program_mib=_program_mib(compiled),
         bound=bound(work, count, row.per_second),
     )
+
+
+def middle(rows: Sequence[Row]) -> Row:
+    """The row of median speed of the same program's in several processes, with their spread."""
+    rows = sorted(rows, key=lambda row: row.per_second)
+    return dataclasses.replace(
+        rows[(len(rows) - 1) // 2],
+        slowest=rows[0].per_second,
+        fastest=rows[-1].per_second,
+        compile_seconds=statistics.median(row.compile_seconds for row in rows),
+        peak_mib=max(row.peak_mib for row in rows),
+    )
+
+
+def in_processes(run: Callable[[], list[Row]], processes: int) -> list[Row]:
+    """Rows of a benchmark run anew in so many processes, one after another.
+
+    Calls within a process agree where processes do not: two of the same program, minutes apart on
+    a quiet machine, may differ by a factor of two.
+
+    Args:
+        run: the benchmark, a function of a module.
+        processes: how many.
+    """
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=spawn, max_tasks_per_child=1) as pool:
+        found = [pool.submit(run).result() for _ in range(processes)]
+    return [middle(rows) for rows in zip(*found, strict=True)]
 
 
 def recount(row: Row, unit: str, factor: float) -> Row:

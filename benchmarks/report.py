@@ -13,9 +13,10 @@ import jax
 import rp_jax
 from benchmarks.bound import Bound, limits
 from benchmarks.compare import Key, earlier, key_of
-from benchmarks.measure import Row
+from benchmarks.measure import Row, in_processes
 from experiments import console
 from rp_jax import storage
+from rp_jax.validate import number
 
 
 def machine() -> dict[str, Any]:
@@ -86,7 +87,11 @@ def _print(name: str, rows: Sequence[Row], before: Mapping[Key, float]) -> None:
 
 
 def report(
-    name: str, rows: Sequence[Row], out: Path | None, before: Mapping[Key, float] | None = None
+    name: str,
+    rows: Sequence[Row],
+    out: Path | None,
+    before: Mapping[Key, float] | None = None,
+    processes: int = 1,
 ) -> None:
     """Prints the rows, and writes them as JSON if `out` is given.
 
@@ -95,12 +100,13 @@ def report(
         rows: at least one.
         out: folder, created if missing.
         before: units per second of an earlier run, by row; adds a column of ratios.
+        processes: that the rows are medians of.
     """
     _print(name, rows, before or {})
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        rows_json = [asdict(row) for row in rows]
-        storage.write_json(out / f"{name}.json", {"machine": machine(), "rows": rows_json})
+        found = {"machine": machine(), "processes": processes, "rows": [asdict(r) for r in rows]}
+        storage.write_json(out / f"{name}.json", found)
 
 
 def command_line(
@@ -118,15 +124,20 @@ def command_line(
     parser.add_argument(
         "--against", type=Path, help="JSON of an earlier run, or a folder of them, to compare with"
     )
+    parser.add_argument(
+        "--processes", type=int, default=3, help="how many, anew, to take medians over"
+    )
     given = parser.parse_args()
     before = {}
-    if given.against is not None:
-        try:
+    try:
+        number("processes", given.processes, least=1, integer=True)
+        if given.against is not None:
             before = earlier(given.against, list(benchmarks))
-        except ValueError as error:
-            parser.error(str(error))
+    except ValueError as error:
+        parser.error(str(error))
     for name, run in benchmarks.items():
-        report(name, run(), given.out, before)
+        rows = run() if given.processes == 1 else in_processes(run, given.processes)
+        report(name, rows, given.out, before, given.processes)
 
 
 def main(name: str, run: Callable[[], list[Row]]) -> None:

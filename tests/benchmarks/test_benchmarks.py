@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import os
 import runpy
 
 import jax
@@ -28,6 +29,7 @@ from experiments import circuit, jam, point_gather
 
 MODULES = {"circuit": circuit, "jam": jam, "point_gather": point_gather}
 
+HERE = ["--processes", "1"]
 LIMITS = bound.Limits(operations=1e11, bytes=1e10)
 
 
@@ -132,6 +134,29 @@ def test_a_row_in_another_unit():
     assert measure.recount(dataclasses.replace(ROW, bound=None), "samples", 4.0).bound is None
 
 
+def test_the_median_of_several_processes_is_taken():
+    first, middle, last = (
+        dataclasses.replace(ROW, per_second=p, compile_seconds=c, peak_mib=m)
+        for p, c, m in ((5.0, 1.0, 30.0), (7.0, 3.0, 10.0), (8.0, 2.0, 20.0))
+    )
+    found = measure.middle([last, first, middle])
+    assert (found.slowest, found.per_second, found.fastest) == (5.0, 7.0, 8.0)
+    assert (found.compile_seconds, found.peak_mib) == (2.0, 30.0)
+    assert found.bound == ROW.bound
+    assert measure.middle([first, last]).per_second == 5.0  # no rate that nothing had
+
+
+def a_process():
+    """A benchmark of one row, as many per second as its process has for a number."""
+    return [dataclasses.replace(ROW, per_second=float(os.getpid()))]
+
+
+def test_each_process_is_a_new_one():
+    (row,) = measure.in_processes(a_process, 2)
+    assert row.slowest < row.fastest
+    assert os.getpid() not in (row.slowest, row.fastest)
+
+
 def test_rows_are_compared_with_an_earlier_run(tmp_path, monkeypatch, capsys):
     report.report("some", [ROW], tmp_path)
     faster = dataclasses.replace(ROW, per_second=5.0)
@@ -141,7 +166,7 @@ def test_rows_are_compared_with_an_earlier_run(tmp_path, monkeypatch, capsys):
         assert before == {("what", "steps", 4): 2.0}
         shown = [report._speed(row, True, before)["x earlier"] for row in (faster, new)]
         assert shown == ["2.50", "-"]
-        monkeypatch.setattr("sys.argv", ["benchmarks.some", "--against", str(against)])
+        monkeypatch.setattr("sys.argv", ["benchmarks.some", "--against", str(against), *HERE])
         capsys.readouterr()
         report.main("some", lambda: [faster, new])
         assert "earlier" in capsys.readouterr().out
@@ -177,6 +202,14 @@ def test_a_bad_earlier_run_is_refused_before_anything_is_measured(
     assert message in " ".join(capsys.readouterr().err.split())
 
 
+def test_no_process_at_all_is_refused(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["benchmarks.some", "--processes", "0"])
+    with pytest.raises(SystemExit) as stop:
+        report.main("some", lambda: pytest.fail("nothing is to be run"))
+    assert stop.value.code == 2
+    assert "processes is 0; it must be" in capsys.readouterr().err
+
+
 def test_a_missing_earlier_run_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"none\.json; it cannot be read"):
         compare.earlier(tmp_path / "none.json", ["some"])
@@ -201,7 +234,7 @@ def test_without_a_folder_nothing_is_written(tmp_path, monkeypatch):
 
 def test_each_benchmark_has_a_command_line_that_is_read_first(tmp_path, monkeypatch):
     out = tmp_path / "results"
-    monkeypatch.setattr("sys.argv", ["benchmarks.some", "--out", str(out)])
+    monkeypatch.setattr("sys.argv", ["benchmarks.some", "--out", str(out), *HERE])
     report.main("some", lambda: [ROW])
     assert [path.name for path in out.iterdir()] == ["some.json"]
     monkeypatch.setattr("sys.argv", ["benchmarks.some", "--help"])
@@ -213,7 +246,7 @@ def test_each_benchmark_has_a_command_line_that_is_read_first(tmp_path, monkeypa
 def test_all_benchmarks_are_run_by_the_package(tmp_path, monkeypatch):
     for module in (env_step, recon, threat_query, train_step, seeds, tabular, adapters):
         monkeypatch.setattr(module, "run", lambda: [ROW])
-    monkeypatch.setattr("sys.argv", ["benchmarks", "--out", str(tmp_path)])
+    monkeypatch.setattr("sys.argv", ["benchmarks", "--out", str(tmp_path), *HERE])
     runpy.run_module("benchmarks", run_name="__main__")
     names = {"env_step", "recon", "threat_query", "train_step", "seeds", "tabular", "adapters"}
     assert {path.stem for path in tmp_path.iterdir()} == names
