@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from quick import compile_soon  # noqa: F401
 
 from examples.crossing import world as crossing
 from examples.trolley import world as trolley

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quick import compile_soon  # noqa: F401
 
 from rp_jax import shield
 from rp_jax.planning import dqn
