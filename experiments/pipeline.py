@@ -111,7 +111,7 @@ def default_out(task: str, preset: str) -> Path:
 def learn_threats(
     task: Task, config: Config, folder: Path, checkpoints: Checkpoints = NO_CHECKPOINTS
 ) -> tuple[dict | None, dict, dict]:
-    """The threat models of all kinds of hazard: loaded, or learned and saved.
+    """The threat models of all kinds of hazard: loaded or learned; and saved in `folder`.
 
     Returns:
         (models, curves, timings), the latter two empty if loaded; None for no shield.
@@ -122,7 +122,10 @@ def learn_threats(
     if not subs:
         return {}, {}, {}
     if config.threat is not None:
-        return artefact.load(config.threat, task.name, subs), {}, {}
+        models = artefact.load(config.threat, task.name, subs)
+        about = storage.read_manifest(config.threat, artefact.KIND)["about"]
+        artefact.save(folder / "threat", task.name, models, subs, about)  # the folder is whole
+        return models, {}, {}
     built = {}
     keys = jax.random.split(key_of(config.seed, THREAT), len(subs))
     for key, kind in zip(keys, sorted(subs), strict=True):

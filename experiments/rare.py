@@ -3,6 +3,8 @@
 Multilevel splitting against plain episodes of as many steps; then a search for the worst starts.
 
 python -m experiments.rare --run results/RUN --variant N=8 --out results/rare
+python -m experiments.rare --run results/NEW --variant N=8 --out results/again \\
+    --starts results/rare/worst_starts   # another agent, from the worst starts of that one
 """
 
 import time
@@ -19,7 +21,10 @@ from experiments import cli, console, pipeline, runs
 from rp_jax import evaluate, rare, statistics, storage
 from rp_jax.envs.base import select
 from rp_jax.planning.pmdp import PMDP
-from rp_jax.validate import number
+from rp_jax.validate import number, one_of
+
+STARTS = "start states"  # what the worst starts are saved as
+MOST_STARTS = 100_000
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,7 @@ class Config:
     tries: int = 50  # episodes from each start
     kept: int = 20  # worst starts that are kept
     checks: int = 2000  # fresh episodes from each of those
+    starts: Path | None = None  # worst starts found before: these alone are played
     seed: int = 0
 
     def validate(self) -> None:
@@ -47,7 +53,7 @@ class Config:
         number("generations", self.generations, least=0, integer=True)
         number("population", self.population, least=10, integer=True)
         number("tries", self.tries, least=1, integer=True)
-        number("kept", self.kept, least=1, most=self.population, integer=True)
+        number("kept", self.kept, least=1, most=min(self.population, MOST_STARTS), integer=True)
         number("checks", self.checks, least=1, integer=True)
         number("seed", self.seed, least=0, most=2**31 - 1, integer=True)
 
@@ -169,20 +175,40 @@ def worst_starts(key: jax.Array, subject: Subject, first: Any, config: Config) -
     return jax.tree.map(lambda a: a[: config.kept], starts)
 
 
+def known_starts(folder: Path, pmdp: PMDP, about: dict[str, Any]) -> Any:
+    """Starts (n, ...) that an earlier search has kept.
+
+    Raises:
+        ValueError: they are missing, damaged, or of another task or test.
+    """
+    found = storage.read_manifest(folder, STARTS)["about"]
+    for field in ("env", "variant"):
+        one_of(f"{folder}: {field}", str(found.get(field)), [about[field]])
+    number(f"{folder}: count", found.get("count"), least=1, most=MOST_STARTS, integer=True)
+    one = jax.eval_shape(pmdp.env.reset, jax.random.key(0), pmdp.params)
+    like = jax.tree.map(lambda a: jax.ShapeDtypeStruct((found["count"], *a.shape), a.dtype), one)
+    return storage.load(folder, STARTS, like)
+
+
 def run(config: Config, loaded: runs.Run, folder: Path) -> dict[str, Any]:
-    """Writes rare.json and, after a search, worst_starts.npz."""
+    """Writes rare.json and, after a search, the folder worst_starts."""
     variant, pmdp, network, weights = loaded.subject(config.variant, config.agent)
+    about = {"env": loaded.task.name, "variant": variant, "sha256": loaded.sha256}
+    row: dict[str, Any] = {**about, "seed": config.seed}
+    known = None if config.starts is None else known_starts(config.starts, pmdp, about)
     values = evaluate.greedy(network, weights)
     subject = Subject(pmdp, values, rare.compiled(values))
     key, search, check = jax.random.split(pipeline.key_of(config.seed, pipeline.RARE), 3)
-    row, starts = estimates(key, subject, config)
-    subject_of = {"env": loaded.task.name, "variant": variant, "sha256": loaded.sha256}
-    row = {**subject_of, **row, "seed": config.seed}
-    storage.write_json(folder / "rare.json", row)  # the search may take long
-    show(row)
-    if config.generations > 0:
-        worst = worst_starts(search, subject, starts, config)
-        crashes = crashes_from(check, subject, worst, config.checks)
+    if known is None:
+        found, first = estimates(key, subject, config)
+        row |= found
+        storage.write_json(folder / "rare.json", row)  # the search may take long
+        show(row)
+        if config.generations > 0:
+            known = worst_starts(search, subject, first, config)
+            storage.save(folder / "worst_starts", STARTS, known, {**about, "count": config.kept})
+    if known is not None:
+        crashes = crashes_from(check, subject, known, config.checks)
         row["worst_starts"] = [
             {
                 "crashes": int(k),
@@ -191,7 +217,6 @@ def run(config: Config, loaded: runs.Run, folder: Path) -> dict[str, Any]:
             }
             for k in crashes
         ]
-        storage.save(folder / "worst_starts", "start states", worst, subject_of)
         storage.write_json(folder / "rare.json", row)
         show_worst(row["worst_starts"])
     return row

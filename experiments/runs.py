@@ -1,6 +1,7 @@
 """Finished runs, read back from their folders: settings, threat models and agents."""
 
 import hashlib
+import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,9 +72,11 @@ def load(folder: Path) -> Run:
     config.validate()
     task: pipeline.Task = module.make_task(config)
     subs = task.env.sub_rmdps(task.train)
-    threats = config.threat or folder / "threat"
+    threats = folder / "threat"
+    if config.threat is not None and not threats.is_dir():  # as earlier versions left it
+        threats = config.threat
     models: dict | None = {}
-    used = [path, folder / "agent" / "manifest.json"]  # these hold the checksums of the arrays
+    used = [folder / "agent" / "manifest.json"]  # these hold the checksums of the arrays
     if np.isinf(config.x):
         models = None
     elif subs:
@@ -81,8 +84,12 @@ def load(folder: Path) -> Run:
         used.append(threats / "manifest.json")
     pmdp = pipeline.make_pmdp(task, config, models, task.train)
     params = agents(folder / "agent", pmdp, config.planning, config.seeds)
-    digest = hashlib.sha256(b"".join(file.read_bytes() for file in used)).hexdigest()
-    return Run(task, config, models, params, digest)
+    # Where a folder lies does not matter.
+    lasting = {name: value for name, value in plain.items() if name not in ("out", "threat")}
+    digest = hashlib.sha256(json.dumps(lasting, sort_keys=True).encode())
+    for file in used:
+        digest.update(file.read_bytes())
+    return Run(task, config, models, params, digest.hexdigest())
 
 
 def agents(folder: Path, pmdp: PMDP, planning: loop.LoopConfig, count: int) -> Any:

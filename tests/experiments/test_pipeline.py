@@ -151,11 +151,16 @@ def test_a_saved_threat_function_serves_another_track_and_threshold(finished, tm
     task = circuit.make_task(config)
     models, curves, seconds = pipeline.learn_threats(task, config, tmp_path)
     assert curves == seconds == {}
-    assert list(tmp_path.iterdir()) == []  # it is not saved again
-    again = artefact.load(finished / "threat", "circuit", task.env.sub_rmdps(task.train))
-    saved = storage.leaves(again)
-    for name, array in storage.leaves(models).items():
-        np.testing.assert_array_equal(array, saved[name])
+    subs = task.env.sub_rmdps(task.train)
+    for folder in (finished, tmp_path):  # the new run's folder is whole without the other's
+        saved = storage.leaves(artefact.load(folder / "threat", "circuit", subs))
+        for name, array in storage.leaves(models).items():
+            np.testing.assert_array_equal(array, saved[name])
+    about = [
+        storage.read_manifest(folder / "threat", artefact.KIND)["about"]
+        for folder in (finished, tmp_path)
+    ]
+    assert about[0] == about[1]
 
 
 def test_without_a_shield_no_threat_is_learned(tmp_path):
@@ -274,7 +279,7 @@ def test_point_gather_has_no_plans():
 def test_its_threat_function_serves_other_thresholds_and_counts(drawn, tmp_path):
     again = f"--no-figures --threat {drawn / 'threat'} --x 0.5 --obstacles 2 --test-obstacles 1 4"
     folder = go("jam", tmp_path / "again", again)
-    assert names(folder) == {name for name in FILES if not name.startswith("threat/")}
+    assert names(folder) == FILES - {"threat/report.json", "threat/curves.json"}
     rows = check_table(folder, ["N=1", "N=4"], [0, 1])
     assert {row["method"] for row in rows} == {"RP (x=0.5)"}
     assert read(folder / "training.json")["inadmissible"] == 0

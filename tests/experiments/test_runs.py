@@ -9,10 +9,11 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from scipy import stats
 from tiny import programs_of_a_moment  # noqa: F401
 
 from experiments import certify, circuit, jam, pipeline, rare, runs, settings
-from rp_jax import evaluate, storage
+from rp_jax import evaluate, statistics, storage
 from rp_jax.envs.tracks import circle_plan
 from rp_jax.planning import loop
 
@@ -71,6 +72,8 @@ def test_the_hash_speaks_of_settings_agents_and_threats(finished, tmp_path):
     shutil.copytree(finished, copy)
     assert runs.load(copy).sha256 == runs.load(finished).sha256
     plain = json.loads((copy / "config.json").read_text())
+    storage.write_json(copy / "config.json", {**plain, "out": None, "threat": "elsewhere"})
+    assert runs.load(copy).sha256 == runs.load(finished).sha256
     storage.write_json(copy / "config.json", {**plain, "x": 0.8})
     assert runs.load(copy).sha256 != runs.load(finished).sha256
 
@@ -140,6 +143,54 @@ def test_rare_events_and_worst_starts_of_a_run(drawn, tmp_path):
     starts = storage.load(out / "worst_starts", "start states", like)
     offset = starts.obstacles.position - starts.agent.position[:, None]
     assert (np.linalg.norm(offset, axis=-1) >= jam.jam.CLEARANCE).all()
+    again = storage.new_folder(tmp_path / "again")
+    only = dataclasses.replace(config, out=again, starts=out / "worst_starts")
+    second = rare.run(only, loaded, again)
+    assert second["worst_starts"] == row["worst_starts"]  # the same agent, starts and keys
+    assert "estimate" not in second
+    assert [path.name for path in again.iterdir()] == ["rare.json"]
+
+
+def test_worst_starts_of_another_task_or_in_no_number_are_refused(drawn, tmp_path):
+    pmdp = runs.load(drawn).pmdp("N=3")
+    about = {"env": "jam", "variant": "N=3"}
+    one = jax.tree.map(lambda a: a[None], jam.jam.reset(jax.random.key(0), pmdp.params))
+    storage.save(tmp_path / "set", rare.STARTS, one, about | {"count": 1})
+    jax.tree.map(
+        np.testing.assert_array_equal, rare.known_starts(tmp_path / "set", pmdp, about), one
+    )
+    with pytest.raises(ValueError, match="variant is 'N=3'; it must be one of 'N=8'"):
+        rare.known_starts(tmp_path / "set", pmdp, about | {"variant": "N=8"})
+    for count in (0, 1.5, None, 2):
+        storage.save(tmp_path / "set", rare.STARTS, one, about | {"count": count})
+        with pytest.raises(ValueError, match=r"set.*it must be"):
+            rare.known_starts(tmp_path / "set", pmdp, about)
+
+
+KEPT = Path(__file__).parents[2] / "docs" / "results"
+
+
+@pytest.mark.slow
+def test_the_agent_that_comes_with_the_project_still_survives_its_worst_starts(tmp_path):
+    """Dynamics, threats and shield may change, but not for the worse: recorded starts, anew."""
+    recorded = json.loads((KEPT / "rare" / "rare.json").read_text())
+    before = np.asarray([[s["crashes"], s["episodes"]] for s in recorded["worst_starts"]])
+    folder = storage.new_folder(tmp_path / "again")
+    config = rare.Config(
+        run=KEPT / "jam_ahead",
+        out=folder,
+        variant=recorded["variant"],
+        starts=KEPT / "rare" / "worst_starts",
+        checks=100,
+        seed=recorded["seed"] + 1,
+    )
+    loaded = runs.load(config.run)
+    assert loaded.sha256 == recorded["sha256"]
+    now = rare.run(config, loaded, folder)["worst_starts"]
+    crashes, episodes = sum(s["crashes"] for s in now), sum(s["episodes"] for s in now)
+    assert episodes == 100 * len(before)
+    k, n = before.sum(axis=0)
+    assert crashes <= stats.binom.ppf(0.9999, episodes, statistics.upper_bound(k, n))
 
 
 def test_offspring_differ_from_their_parent_in_some_obstacles():
