@@ -5,12 +5,13 @@ learns nothing. Counts the crashes while learning as well as those after it.
 
 python -m experiments.compare --env jam
 python -m experiments.compare --env jam --methods DQN --steps 12000000   # ten times as many
+python -m experiments.compare --env jam --methods CPO --steps 12000000 --cpo.rollout.length 256
 """
 
 import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ from experiments import cli, console, mpc, pipeline, policy_gradient, tables, tr
 from experiments.runs import EXPERIMENTS
 from experiments.settings import begin
 from rp_jax import storage
-from rp_jax.baselines import cpo, pid_lagrangian
+from rp_jax.baselines.cpo import CPOConfig
+from rp_jax.baselines.pid_lagrangian import PIDConfig
 from rp_jax.checkpoints import Checkpoints
 from rp_jax.validate import number, one_of
 
@@ -45,6 +47,8 @@ class Config:
     seed: int = 0  # of the first
     episodes: int = 2_000  # evaluated per variant and seed
     mpc_episodes: int = 200  # MPC is slow
+    cpo: CPOConfig = field(default_factory=CPOConfig)
+    pid: PIDConfig = field(default_factory=PIDConfig)
     threat: Path | None = None  # folder of a threat function to use again
     out: Path | None = None  # folder for results; default: results/compare-ENV-TIME
 
@@ -62,6 +66,8 @@ def settings_of(config: Config) -> Any:
         raise ValueError("methods is (); it must name at least one")
     number("steps", config.steps, least=1000, integer=True)
     number("mpc_episodes", config.mpc_episodes, least=1, integer=True)
+    config.cpo.validate("cpo")
+    config.pid.validate("pid")
     quick = module.quick("tuned")
     settings = dataclasses.replace(
         quick,
@@ -139,10 +145,7 @@ def run(
         members = [m._replace(learning_penalty=p) for p in penalties for m in each]
         at = checkpoints.at("dqn")
         add(by_q_learning(task, plain, None, members, folder / "dqn", at))
-    on_policy: dict[str, tuple[str, Any]] = {
-        "CPO": ("CPO", cpo.CPOConfig()),
-        "PID": ("PID-Lagrangian", pid_lagrangian.PIDConfig()),
-    }
+    on_policy = {"CPO": ("CPO", config.cpo), "PID": ("PID-Lagrangian", config.pid)}
     for method, (name, learning) in on_policy.items():
         if method in config.methods:
             out, at = folder / method.lower(), checkpoints.at(method.lower())

@@ -1,7 +1,6 @@
 """All methods side by side, as small as they get."""
 
 import dataclasses
-import functools
 import json
 import sys
 
@@ -9,21 +8,21 @@ import pytest
 from tiny import programs_of_a_moment  # noqa: F401
 
 from experiments import compare
-from rp_jax.baselines import cpo, pid_lagrangian
 from rp_jax.baselines.actor_critic import ActorCriticConfig
+from rp_jax.baselines.cpo import CPOConfig
+from rp_jax.baselines.pid_lagrangian import PIDConfig
 
-SMALL = ActorCriticConfig(num_envs=8, length=16, epochs=1, minibatches=2)
+SMALL = {"num-envs": 8, "length": 16, "epochs": 1, "minibatches": 2}
 
 
 @pytest.mark.slow
 def test_every_method_has_its_rows(finished, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(cpo, "CPOConfig", functools.partial(cpo.CPOConfig, SMALL))
-    monkeypatch.setattr(
-        pid_lagrangian, "PIDConfig", functools.partial(pid_lagrangian.PIDConfig, SMALL)
-    )
     monkeypatch.setitem(compare.SETTINGS, "circuit", ((0.0, 20.0), 1e-3, 1))
     out = tmp_path / "compare"
     words = "compare --env circuit --steps 6000 --episodes 8 --mpc-episodes 2"
+    for method in ("cpo", "pid"):
+        for name, value in SMALL.items():
+            words += f" --{method}.rollout.{name} {value}"
     files = ["--threat", str(finished / "threat"), "--out", str(out)]
     monkeypatch.setattr(sys, "argv", [*words.split(), *files])
     compare.main()
@@ -70,6 +69,8 @@ def test_every_method_has_its_rows(finished, tmp_path, monkeypatch, capsys):
         ({"episodes": 0}, "episodes"),
         ({"mpc_episodes": 0}, "mpc_episodes"),
         ({"seeds": 0}, "seeds"),
+        ({"cpo": CPOConfig(divergence=0)}, "cpo.divergence"),
+        ({"pid": PIDConfig(rollout=ActorCriticConfig(minibatches=7))}, "pid.rollout.minibatches"),
     ],
 )
 def test_bad_settings_are_named(change, field):
