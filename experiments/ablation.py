@@ -52,8 +52,8 @@ def show(name: str, rows: Sequence[Mapping[str, Any]]) -> None:
         {
             "variant": row["variant"],
             "method": row["method"],
-            "return": f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}",
-            "crashes": f"{row['crashes']:,} of {row['episodes']:,}",
+            "return": tables.earned(row),
+            "crashes": tables.crashed(row),
             "% [95 %]": tables.percent(row),
             "goal": f"{row['goal_rate']:.3f}",
         }

@@ -45,6 +45,7 @@ from experiments.paper import (
 )
 from experiments.paper.commands import COMMANDS, SIZES
 from experiments.paper.scores import read
+from experiments.paper.section import CLOSE
 from experiments.paper.sources import LOG, RunError, Sources
 from rp_jax import storage
 from rp_jax.validate import one_of
@@ -135,13 +136,15 @@ def blocks(folder: Path, preset: str, failed: dict[str, str]) -> list[report.Blo
     out: list[report.Block] = [
         report.Heading("The paper's figures and tables, and more", 1),
         f"Preset {preset}; report by {versions}, {os.cpu_count()} cores, {machine['device']}. "
-        "Crash rates have exact 95 % intervals (Clopper-Pearson); returns, Student's over seeds, "
-        "or over episodes where there is one seed.",
-        f"{len(claims)} published claims: "
+        "Crash rates have 95 % intervals of Clopper and Pearson, over the episodes of all seeds "
+        "pooled; returns, Student's over seeds, or over episodes where there is one seed.",
+        f"{len(claims)} verdicts: "
         + "; ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
-        + ". A return has exceeded the published one if its whole interval lies above, and "
-        "reproduces it if the interval reaches it; a crash rate reproduces the published one, "
-        "which has two digits, if its whole interval does not exceed it as rounded.",
+        + ". There is one for each kind of RP where a published entry is of RP. Several seeds "
+        "have exceeded a published return if their whole interval lies above it; a return is "
+        "reproduced if the mean reaches it, or the interval does and the mean falls short by at "
+        f"most {100 * CLOSE:g} %. A crash rate reproduces the published one, which has two "
+        "digits, if its whole interval does not exceed it as rounded.",
         report.verdicts(claims, "All verdicts"),
     ]
     for name, section in told.items():
@@ -166,7 +169,7 @@ def ledger(folder: Path) -> list[dict[str, Any]]:
                 {
                     "run": name,
                     "command": log[0]["command"],
-                    "commit": log[-1]["commit"],
+                    "commit": ", ".join(dict.fromkeys(entry["commit"] for entry in log)),
                     "CPU minutes": f"{sum(entry['cpu_seconds'] for entry in log) / 60:.1f}",
                     "minutes": f"{sum(entry['seconds'] for entry in log) / 60:.1f}",
                 }

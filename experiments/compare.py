@@ -96,6 +96,25 @@ def by_q_learning(
     return with_learning(rows, trained)
 
 
+def by_policy_gradient(
+    name: str,
+    learning: Any,
+    limit: float,
+    task: pipeline.Task,
+    config: Any,
+    folder: Path,
+    checkpoints: Checkpoints,
+) -> list[dict[str, Any]]:
+    """Rows of CPO or PID-Lagrangian PPO."""
+    at = checkpoints.at("planning")
+    trained = policy_gradient.learn(name, learning, limit, task, config, folder, at)
+    pmdp, members = pipeline.make_pmdp(task, config, None, task.train), pipeline.members_of(config)
+    policy = policy_gradient.modes(learning, pmdp)
+    agents = pipeline.Agents(members, [name] * len(members), policy, trained)
+    rows = pipeline.evaluate_all(task, config, pmdp, agents, checkpoints.at("evaluation"))
+    return with_learning(rows, trained)
+
+
 def with_learning(
     rows: Sequence[Mapping[str, Any]], trained: training.Trained
 ) -> list[dict[str, Any]]:
@@ -149,9 +168,7 @@ def run(
     for method, (name, learning) in on_policy.items():
         if method in config.methods:
             out, at = folder / method.lower(), checkpoints.at(method.lower())
-            trained = policy_gradient.learn(name, learning, limit, task, settings, out, at)
-            found = policy_gradient.evaluate_all(name, learning, trained, task, settings)
-            add(with_learning(found, trained))
+            add(by_policy_gradient(name, learning, limit, task, settings, out, at))
     if "MPC" in config.methods:
         add(by_search(config, horizon))
     return rows
@@ -169,8 +186,8 @@ def show(rows: Sequence[dict[str, Any]]) -> None:
                 {
                     "method": row["method"],
                     "seed": row["seed"],
-                    "return": f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}",
-                    "crashes": f"{row['crashes']:,} of {row['episodes']:,}",
+                    "return": tables.earned(row),
+                    "crashes": tables.crashed(row),
                     "% [95 %]": tables.percent(row),
                     "steps": f"{row['training_steps']:,}" if row["training_steps"] else "-",
                     "crashes while learning": learned if row["training_steps"] else "-",

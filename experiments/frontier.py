@@ -108,8 +108,8 @@ def show(rows: Sequence[dict[str, Any]]) -> None:
             {
                 "planner": row["planner"],
                 "x": f"{row['x']:g}",
-                "return": f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}",
-                "crashes": f"{row['crashes']:,} of {row['episodes']:,}",
+                "return": tables.earned(row),
+                "crashes": tables.crashed(row),
                 "% [95 %]": tables.percent(row),
                 "insecure": row["insecure"],
             }

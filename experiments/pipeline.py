@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import linen as nn
 
 import rp_jax
 from experiments import console, tables, training
 from experiments.training import Member, Trained
-from rp_jax import devices, evaluate, shield, storage
+from rp_jax import devices, evaluate, storage
 from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
 from rp_jax.envs.base import BASELINES, Env
 from rp_jax.planning import loop
@@ -283,19 +284,19 @@ def plan(
         first = begin.lower(keys, pmdp).compile()
         compiled = time.perf_counter()
 
-        def step(i: int, state: loop.LoopState) -> tuple[loop.LoopState, Any]:
+        def step(i: int, state: loop.LoopState) -> tuple[loop.LoopState, dict[str, Any]]:
             now = during(pmdp, i / chunks, config)
             state, metrics = program(state, now, length, planning.updates)
-            return state, devices.gather(metrics, mesh)
+            return state, devices.gather(metrics, mesh)._asdict()
 
-        def check(params: Any, metrics: Any) -> None:
-            loop.check(devices.gather(params, mesh), metrics)
+        def check(params: Any, metrics: dict[str, Any]) -> None:
+            loop.check(devices.gather(params, mesh), loop.Metrics(**metrics))
 
         state, filled = program(first(keys, pmdp), during(pmdp, 0.0, config), planning.filling, 0)
-        filled = devices.gather(filled, mesh)
-        metrics = jax.tree.map(lambda m: np.zeros((chunks, *m.shape), m.dtype), filled)
-        for whole, part in zip(metrics, filled, strict=True):
-            whole[0] = part  # what filled the replay belongs to the first chunk
+        metrics = {}
+        for name, part in devices.gather(filled, mesh)._asdict().items():
+            metrics[name] = np.zeros((chunks, *part.shape), part.dtype)
+            metrics[name][0] = part  # what filled the replay belongs to the first chunk
         params, rows, seconds = training.learn(
             training.Learners(members, names, config.penalty, folder, more),
             state,
@@ -312,12 +313,20 @@ def plan(
     return Trained(params, rows, seconds, compiled - began)
 
 
+class Agents(NamedTuple):
+    """Who is evaluated."""
+
+    members: Sequence[Member]
+    names: Sequence[str]  # of their methods
+    policy: Callable[[Any], evaluate.Policy]  # of one member's parameters
+    trained: Trained
+
+
 def evaluate_all(
     task: Task,
     config: Config,
     pmdp: PMDP,
-    members: Sequence[Member],
-    trained: Trained,
+    agents: Agents,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> list[dict[str, Any]]:
     """One row per variant and member.
@@ -325,39 +334,13 @@ def evaluate_all(
     Raises:
         FloatingPointError: an observation, a threat or a reward is not a finite number.
     """
-    pmdp, axes = side_by_side(pmdp, members)
-    network = loop.make_network(config.planning, pmdp)
-    batch = min(1000, config.episodes)
-
-    def one(key, params, pmdp):
-        values = evaluate.greedy(network, params)
-        return evaluate.run_episodes(key, pmdp, values, config.episodes, batch=batch)
-
-    mesh, places = devices.mesh_of(config.devices), (0, 0, axes)
-    everyone = jax.jit(devices.spread(one, places, mesh))
-    keys = keys_of(members, EVALUATION)
-    variants = {name: pmdp.replace(params=params) for name, params in task.tests.items()}
-    with console.progress("evaluation") as bar:
-
-        def play(i: int, found: dict[str, evaluate.Episodes]) -> dict[str, evaluate.Episodes]:
-            name, this = list(variants.items())[i]
-            bar("", i, len(variants), f"{name}: {config.episodes:,} episodes a seed")
-            given = devices.place((keys, trained.params, this), places, mesh)
-            episodes = jax.tree.map(np.asarray, devices.gather(everyone(*given), mesh))
-            evaluate.check(episodes, name)
-            bar("", i + 1, len(variants))
-            return {**found, name: episodes}
-
-        shapes = {
-            name: jax.eval_shape(everyone, keys, trained.params, this)
-            for name, this in variants.items()
-        }
-        blank = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), shapes)
-        episodes = checkpoints.loop(blank, play, len(variants))
+    members, trained = agents.members, agents.trained
+    variants, episodes = play_all(task, config, pmdp, agents, checkpoints)
     first = jax.tree.map(lambda a: a[0], trained.params)
     rows = []
     for variant, this in variants.items():
-        seconds = action_seconds(this.replace(x=this.x[0]), network, first)
+        act = acting(this.replace(x=this.x[0]), agents.policy, first)
+        seconds, _ = action_seconds(key_of(config.seed, EVALUATION), task.env, this.params, act)
         for i, member in enumerate(members):
             found = evaluate.summarise(
                 jax.tree.map(lambda a, i=i: a[i], episodes[variant]), config.penalty
@@ -366,8 +349,8 @@ def evaluate_all(
                 {
                     "env": task.name,
                     "variant": variant,
-                    "method": method_name(config, member),
-                    "x": member.x,
+                    "method": agents.names[i],
+                    "x": member.x if pmdp.threats is not None else float("inf"),
                     "seed": member.seed,
                     **found,
                     "seconds_per_100_actions": seconds,
@@ -375,6 +358,37 @@ def evaluate_all(
                 }
             )
     return rows
+
+
+def play_all(
+    task: Task, config: Config, pmdp: PMDP, agents: Agents, checkpoints: Checkpoints
+) -> tuple[dict[str, PMDP], dict[str, evaluate.Episodes]]:
+    """By variant, the members' P-MDPs and their episodes (members, episodes)."""
+    pmdp, axes = side_by_side(pmdp, agents.members)
+    batch = min(1000, config.episodes)
+
+    def one(key, params, pmdp):
+        policy = agents.policy(params)
+        return evaluate.play_episodes(key, pmdp, policy, config.episodes, batch=batch)
+
+    mesh, places = devices.mesh_of(config.devices), (0, 0, axes)
+    everyone = jax.jit(devices.spread(one, places, mesh))
+    keys, params = keys_of(agents.members, EVALUATION), agents.trained.params
+    variants = {name: pmdp.replace(params=test) for name, test in task.tests.items()}
+    with console.progress(f"{agents.names[0]}, evaluation") as bar:
+
+        def play(i: int, found: dict[str, evaluate.Episodes]) -> dict[str, evaluate.Episodes]:
+            name, this = list(variants.items())[i]
+            bar("", i, len(variants), f"{name}: {config.episodes:,} episodes a seed")
+            given = devices.place((keys, params, this), places, mesh)
+            episodes = jax.tree.map(np.asarray, devices.gather(everyone(*given), mesh))
+            evaluate.check(episodes, name)
+            bar("", i + 1, len(variants))
+            return {**found, name: episodes}
+
+        shapes = {name: jax.eval_shape(everyone, keys, params, p) for name, p in variants.items()}
+        blank = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), shapes)
+        return variants, checkpoints.loop(blank, play, len(variants))
 
 
 def plan_and_evaluate(
@@ -388,30 +402,55 @@ def plan_and_evaluate(
     """`plan` into a folder, created if missing, then `evaluate_all`."""
     folder.mkdir(exist_ok=True)
     trained = plan(task, config, pmdp, members, folder, checkpoints.at("planning"))
-    found = evaluate_all(task, config, pmdp, members, trained, checkpoints.at("evaluation"))
-    return trained, found
+    network = loop.make_network(config.planning, pmdp)
+    names = [method_name(config, member) for member in members]
+    agents = Agents(members, names, greedily(network), trained)
+    return trained, evaluate_all(task, config, pmdp, agents, checkpoints.at("evaluation"))
 
 
-def action_seconds(pmdp: PMDP, network: Any, params: Any) -> float:
-    """Wall time of 100 decisions one after another, observation and threat included."""
-    state = jax.vmap(pmdp.env.reset, (0, None))(jax.random.split(jax.random.key(0), 1), pmdp.params)
+def greedily(network: nn.Module) -> Callable[[Any], evaluate.Policy]:
+    """The policy of a Q-network's weights: greedy inside the admissible set."""
+    return lambda weights: evaluate.shielded(evaluate.greedy(network, weights))
+
+
+def acting(
+    pmdp: PMDP, policy: Callable[[Any], evaluate.Policy], params: Any
+) -> Callable[[Any], jax.Array]:
+    """What chooses an action in a state, observation and threat included; compiled."""
 
     @jax.jit
-    def act(states, weights, pmdp):
-        percept = pmdp.perceive(states)
-        values = evaluate.greedy(network, weights)(percept)
-        return jax.vmap(shield.masked_argmax)(values, percept.admissible)
+    def act(state: Any, params: Any, pmdp: PMDP) -> jax.Array:
+        percept = pmdp.perceive(jax.tree.map(lambda a: a[None], state))
+        return policy(params)(jax.random.key(0), percept)[0][0]
 
-    return seconds_of_100(lambda: act(state, params, pmdp))
+    return lambda state: act(state, params, pmdp)
 
 
-def seconds_of_100(act: Callable[[], jax.Array]) -> float:
-    """Wall time of 100 calls one after another, without a first one that compiles."""
-    act().block_until_ready()
-    began = time.perf_counter()
-    for _ in range(100):
-        act().block_until_ready()
-    return time.perf_counter() - began
+def action_seconds(
+    key: jax.Array, env: Env, params: Any, act: Callable[[Any], jax.Array], actions: int = 100
+) -> tuple[float, float]:
+    """(wall, CPU) time of decisions, each in the state that the one before it led to.
+
+    Args:
+        key: of the environment.
+        env: the environment.
+        params: of it.
+        act: maps a state to an action; called once before, to compile.
+        actions: how many.
+    """
+    reset, step = jax.jit(env.reset), jax.jit(env.step)
+    clocks = lambda: np.asarray([time.perf_counter(), time.process_time()])  # noqa: E731
+    state, seconds = reset(key, params), np.zeros(2)
+    act(state).block_until_ready()
+    for k in range(actions):
+        began = clocks()
+        action = act(state).block_until_ready()
+        seconds += clocks() - began
+        key = jax.random.fold_in(key, k)
+        state, outcome = step(key, state, action, params)
+        if outcome.done:
+            state = reset(key, params)
+    return float(seconds[0]), float(seconds[1])
 
 
 def checked(make_task: Callable[[Any], Task], config: Config) -> Task:

@@ -1,8 +1,8 @@
-"""CPO and PID-Lagrangian PPO on a task: learning, with its curves, and evaluation."""
+"""CPO and PID-Lagrangian PPO on a task: learning, with its curves, and how they act then."""
 
 import functools
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,16 @@ from experiments import console, pipeline, training
 from rp_jax import evaluate
 from rp_jax.baselines import actor_critic, cpo, pid_lagrangian
 from rp_jax.checkpoints import Checkpoints
+from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import finite
 
 LEARNERS: Mapping[str, Any] = {"CPO": cpo, "PID-Lagrangian": pid_lagrangian}
+UPDATES = (
+    "kl",
+    "recoveries",
+    "accepted",
+    "multiplier",
+)  # columns of metrics.jsonl, if they have it
 
 
 def learn(
@@ -48,13 +55,16 @@ def learn(
     chunks, length = training.chunks_of(-(-config.planning.steps // learning.rollout.steps))
     folder.mkdir(exist_ok=True)
 
-    def chunk(state: Any, pmdp: Any, c: jax.Array) -> tuple[Any, actor_critic.Metrics]:
-        def one(state: Any, _: None) -> tuple[Any, actor_critic.Metrics]:
+    def chunk(state: Any, pmdp: PMDP, c: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
+        def one(state: Any, _: None) -> tuple[Any, dict[str, jax.Array]]:
             state, metrics = learner.step(state, pmdp, c, learning)
-            return state, metrics.rollout
+            return state, metrics.rollout._asdict() | updates(metrics)
 
         state, metrics = jax.lax.scan(one, state, None, length=length)
         return state, jax.tree.map(lambda m: jnp.sum(m, axis=0), metrics)
+
+    def more(sums: Mapping[str, float]) -> dict[str, Any]:
+        return {key: sums[key] / length for key in UPDATES if key in sums}
 
     with console.progress(name) as bar:
         bar("", 0, chunks, "compiling")
@@ -69,80 +79,55 @@ def learn(
         improve = jitted.lower(state, pmdp, c).compile()
         compiled = time.perf_counter()
 
-        def check(params: Any, _: Any) -> None:
+        def step(_: int, state: Any) -> tuple[Any, dict[str, jax.Array]]:
+            state, metrics = improve(state, pmdp, c)
+            # Not finite, it stops CPO without a word: no step is then accepted.
+            critic = carried(state).critic
+            finite(f"{name}: values' weights", jax.flatten_util.ravel_pytree(critic)[0])
+            return state, metrics
+
+        def check(params: Any, metrics: dict[str, Any]) -> None:
             finite(f"{name}: weights", jax.flatten_util.ravel_pytree(params)[0])
+            for key in ("score", "danger"):
+                finite(f"{name}: {key}", metrics[key])
 
         shapes = jax.eval_shape(jitted, state, pmdp, c)[1]
         params, rows, seconds = training.learn(
-            training.Learners(members, [name] * len(members), config.penalty, folder),
+            training.Learners(members, [name] * len(members), config.penalty, folder, more),
             state,
-            jax.tree.map(lambda s: np.zeros((chunks, *s.shape), s.dtype), shapes),
-            lambda i, state: improve(state, pmdp, c),
+            {key: np.zeros((chunks, *s.shape), s.dtype) for key, s in shapes.items()},
+            step,
             check,
-            weights,
+            lambda state: carried(state).actor,
             bar,
             checkpoints,
         )
     return training.Trained(params, rows, seconds, compiled - began)
 
 
-def weights(state: Any) -> Any:
-    """Those of the policy, in the state of either learner."""
-    return state.actor if isinstance(state, actor_critic.State) else state.learner.actor
+def carried(state: Any) -> actor_critic.State:
+    """Actor and critic, in the state of either learner."""
+    return state if isinstance(state, actor_critic.State) else state.learner
 
 
-def evaluate_all(
-    name: str,
-    learning: Any,
-    trained: training.Trained,
-    task: pipeline.Task,
-    config: Any,
-) -> list[dict[str, Any]]:
-    """One row per variant and seed, of the policies' modes.
+def updates(metrics: Any) -> dict[str, jax.Array]:
+    """What an update did, as numbers to be averaged; of either learner."""
+    if isinstance(metrics, pid_lagrangian.Metrics):
+        return {"multiplier": metrics.penalty}
+    kl, case, accepted = metrics.update
+    return {
+        "kl": kl,
+        "recoveries": (case == cpo.RECOVERY).astype(kl.dtype),
+        "accepted": accepted.astype(kl.dtype),
+    }
+
+
+def modes(learning: Any, pmdp: PMDP) -> Callable[[Any], evaluate.Policy]:
+    """The policy of an actor's weights that always takes its mode.
 
     Args:
-        name: of the method.
-        learning: its configuration.
-        trained: by `learn`.
-        task: what was learned.
-        config: the task's settings.
+        learning: configuration of the learner.
+        pmdp: what it has learned in.
     """
-    members = pipeline.members_of(config)
-    pmdp = pipeline.make_pmdp(task, config, None, task.train)
-    network: Any = actor_critic.make_actor(pmdp, learning.rollout)
-    batch = min(1000, config.episodes)
-
-    def one(key: jax.Array, weights: Any, pmdp: Any) -> evaluate.Episodes:
-        policy = actor_critic.driver(network, weights, greedy=True)
-        return evaluate.play_episodes(key, pmdp, policy, config.episodes, batch=batch)
-
-    everyone = jax.jit(jax.vmap(one, (0, 0, None)))
-    act = jax.jit(
-        lambda states, weights, pmdp: network.apply(weights, pmdp.perceive(states).encoded).mode
-    )
-    keys = pipeline.keys_of(members, pipeline.EVALUATION)
-    first = jax.tree.map(lambda a: a[0], trained.params)
-    rows = []
-    with console.progress(f"{name}, evaluation") as bar:
-        for done, (variant, params) in enumerate(task.tests.items()):
-            bar("", done, len(task.tests), variant)
-            this = pmdp.replace(params=params)
-            found = jax.tree.map(np.asarray, everyone(keys, trained.params, this))
-            evaluate.check(found, f"{name}, {variant}")
-            start = jax.vmap(this.env.reset, (0, None))(keys[:1], params)
-            seconds = pipeline.seconds_of_100(functools.partial(act, start, first, this))
-            for i, member in enumerate(members):
-                mine = jax.tree.map(lambda a, i=i: a[i], found)
-                rows.append(
-                    {
-                        "env": task.name,
-                        "variant": variant,
-                        "method": name,
-                        "seed": member.seed,
-                        **evaluate.summarise(mine, config.penalty),
-                        "seconds_per_100_actions": seconds,
-                        "train_seconds": trained.seconds,
-                    }
-                )
-            bar("", done + 1, len(task.tests))
-    return rows
+    network = actor_critic.make_actor(pmdp, learning.rollout)
+    return lambda weights: actor_critic.driver(network, weights, greedy=True)

@@ -71,7 +71,7 @@ def estimates(key: jax.Array, subject: Subject, config: Config) -> tuple[dict[st
     pilot, key, plain_key = jax.random.split(key, 3)
     pmdp, values, stage = subject
     began = time.perf_counter()
-    levels = rare.choose_levels(pilot, pmdp, config.particles, stage)
+    levels, steps = rare.choose_levels(pilot, pmdp, config.particles, stage)
     found = []
     with console.progress("splitting") as bar:
         for i in range(config.repeats):
@@ -79,14 +79,14 @@ def estimates(key: jax.Array, subject: Subject, config: Config) -> tuple[dict[st
             this = jax.random.fold_in(key, i)
             found.append(rare.splitting(this, pmdp, values, levels, config.particles, stage=stage))
         bar("", config.repeats, config.repeats)
-    steps = sum(run.steps for run in found)
+    steps += sum(run.steps for run in found)
     mean, width = statistics.mean_interval(np.asarray([run.estimate for run in found]))
     took = time.perf_counter() - began
     n = k = played = 0
     with console.progress("plain episodes") as bar:
         while played < steps:
-            this = jax.random.fold_in(plain_key, n)
-            paths = stage(this, rare.begin(this, pmdp, config.particles), pmdp, np.float32(np.inf))
+            start, play = jax.random.split(jax.random.fold_in(plain_key, n))
+            paths = stage(play, rare.begin(start, pmdp, config.particles), pmdp, np.float32(np.inf))
             n, k = n + config.particles, k + int(paths.crashed.sum())
             played += int(paths.length.sum())
             bar("", min(played, steps), steps, f"{k} crashes of {n:,}")
@@ -97,7 +97,8 @@ def estimates(key: jax.Array, subject: Subject, config: Config) -> tuple[dict[st
         if any(len(r.rates) == len(levels) + 1 for r in found)
         else [],
         "estimate": mean,
-        "ci95": [max(0.0, mean - width), mean + width],
+        # Of repeats without a crash, the spread says nothing.
+        "ci95": [max(0.0, mean - width), mean + width] if mean > 0 else None,
         "repeats": config.repeats,
         "steps": steps,
         "seconds": took,
@@ -229,7 +230,7 @@ def show(row: dict[str, Any]) -> None:
         {
             "by": f"splitting, {len(row['levels'])} levels, {row['repeats']} repeats",
             "crash rate": f"{row['estimate']:.3g}",
-            "95 %": "[{:.3g}, {:.3g}]".format(*row["ci95"]),
+            "95 %": "[{:.3g}, {:.3g}]".format(*row["ci95"]) if row["ci95"] else "-",
             "steps": f"{row['steps']:,}",
         },
         {

@@ -159,7 +159,8 @@ def compare(config: Config, task: pipeline.Task, folder: Path) -> list[dict[str,
                 bar("", len(rows) * rounds + len(found), len(cases) * rounds, f"{name}, {shown}")
                 found.append(jax.tree.map(np.asarray, play(key, pmdp, policy.weights)))
             every = jax.tree.map(lambda *a: np.concatenate(a)[: config.episodes], *found)
-            rows.append({"policy": name, "shield": shown, **evaluate.summarise(every, 50.0)})
+            found_of = evaluate.summarise(every, settings.penalty)
+            rows.append({"policy": name, "shield": shown, **found_of})
         bar("", len(cases) * rounds, len(cases) * rounds)
     return rows
 
@@ -172,7 +173,7 @@ def show(rows: Sequence[dict[str, Any]]) -> None:
             "shield": row["shield"],
             "crashes": f"{row['crashes']:,}",
             "% [95 %]": tables.percent(row),
-            "return": f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}",
+            "return": tables.earned(row),
             "replaced %": f"{100 * row['interventions']:.1f}",
         }
         for row in rows

@@ -49,8 +49,8 @@ def write(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         shown = [
             {
                 "case": row["variant"],
-                "return over seeds": f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}",
-                "crashes": f"{row['crashes']:,} of {row['episodes']:,}",
+                "return over seeds": earned(row),
+                "crashes": crashed(row),
                 "% [95 %]": percent(row),
             }
             for row in summary
@@ -80,10 +80,22 @@ def percent(row: Mapping[str, Any]) -> str:
     return f"{100 * row['crash_rate']:.3f} [{low:.3f}, {high:.3f}]"
 
 
-def over_seeds(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Per variant, the mean and interval of the seeds' returns, and all their crashes together.
+def earned(row: Mapping[str, Any]) -> str:
+    """The return and the half-width of its 95 % interval."""
+    return f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}"
 
-    The interval is that of the mean over seeds; of one seed alone, over its episodes.
+
+def crashed(row: Mapping[str, Any]) -> str:
+    """Crashes of episodes."""
+    return f"{row['crashes']:,} of {row['episodes']:,}"
+
+
+def over_seeds(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Per variant, the mean and interval of the seeds' returns, and all their crashes pooled.
+
+    The interval of returns is that of the mean over seeds; of one seed alone, over its episodes.
+    That of the crash rate is of all episodes as if one agent had played them: it is exact for
+    these agents together, and does not say how another seed would do.
     """
     found = []
     for variant in dict.fromkeys(row["variant"] for row in rows):

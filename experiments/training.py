@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from experiments import console
@@ -37,7 +36,7 @@ class Learners(NamedTuple):
 class Record(NamedTuple):
     """What happened in each chunk."""
 
-    metrics: Any  # (chunks, members) sums
+    metrics: dict[str, np.ndarray]  # (chunks, members) sums, by name
     seconds: np.ndarray  # (chunks,) since the beginning, interruptions left out
 
 
@@ -59,9 +58,9 @@ def chunks_of(units: int) -> tuple[int, int]:
 def learn(
     learners: Learners,
     state: Any,
-    metrics: Any,
-    step: Callable[[int, Any], tuple[Any, Any]],
-    check: Callable[[Any, Any], None],
+    metrics: dict[str, np.ndarray],
+    step: Callable[[int, Any], tuple[Any, Mapping[str, Any]]],
+    check: Callable[[Any, dict[str, np.ndarray]], None],
     weights: Callable[[Any], Any],
     bar: console.Bar,
     checkpoints: Checkpoints,
@@ -71,7 +70,8 @@ def learn(
     Args:
         learners: what learns.
         state: before the first chunk.
-        metrics: (chunks, members) what is counted already, mostly zeros.
+        metrics: by name, (chunks, members): what is counted already, mostly zeros. There must be
+            steps, episodes, score, danger, crashes and goals.
         step: (i, state) -> (state after chunk i, its metrics (members,)).
         check: raises FloatingPointError if the weights or a chunk's metrics are no numbers.
         weights: those that act, in a state.
@@ -81,7 +81,7 @@ def learn(
     Returns:
         (weights, one row per chunk and member, seconds).
     """
-    chunks = len(metrics.steps)
+    chunks = len(metrics["steps"])
     now = time.perf_counter()
 
     def tell(record: Record, done: int) -> list[dict[str, Any]]:
@@ -93,11 +93,11 @@ def learn(
         nonlocal now
         state, record = carried
         state, new = step(i, state)
-        for whole, part in zip(record.metrics, new, strict=True):
-            whole[i] += part
-        check(weights(state), jax.tree.map(lambda m: m[i], record.metrics))
+        for name, whole in record.metrics.items():
+            whole[i] += new[name]
+        check(weights(state), {name: whole[i] for name, whole in record.metrics.items()})
         now, before = time.perf_counter(), now
-        record.seconds[i] = record.seconds[i - 1] + now - before
+        record.seconds[i] = record.seconds[i - 1] + (now - before)  # which float32 can hold
         bar("", i + 1, chunks, note(tell(record, i + 1)[-len(learners.members) :]))
         return state, record
 
@@ -113,10 +113,10 @@ def learn(
 def history(learners: Learners, record: Record, done: int) -> list[dict[str, Any]]:
     """One row per member and chunk of the `done` first ones."""
     rows = []
-    steps = np.cumsum(record.metrics.steps.astype(int), axis=0)
+    steps = np.cumsum(record.metrics["steps"].astype(int), axis=0)
     for chunk in range(done):
         for i, member in enumerate(learners.members):
-            of = {name: float(m[chunk, i]) for name, m in record.metrics._asdict().items()}
+            of = {name: float(m[chunk, i]) for name, m in record.metrics.items()}
             ended = max(of["episodes"], 1.0)
             rows.append(
                 {
@@ -127,6 +127,7 @@ def history(learners: Learners, record: Record, done: int) -> list[dict[str, Any
                     "return_mean": (of["score"] - learners.penalty * of["danger"]) / ended
                     if of["episodes"]
                     else float("nan"),
+                    "danger": of["danger"],
                     "crashes": int(of["crashes"]),
                     "goal_rate": of["goals"] / ended,
                     "seconds": float(record.seconds[chunk]),

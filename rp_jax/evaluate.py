@@ -139,7 +139,8 @@ def summarise(rows: Episodes, penalty: float) -> dict[str, Any]:
 
     A crash is an episode with any danger. `crash_ci95` is the two-sided Clopper-Pearson interval of
     the crash rate, `crash_upper95` the one-sided bound: what these episodes exclude. `danger_mean`
-    is the danger of an episode, undiscounted, and `danger_ci95` its half-width.
+    is the danger of an episode, undiscounted, and `danger_ci95` its half-width; nan where there is
+    none, for then its spread says nothing.
 
     Args:
         rows: arrays (n,).
@@ -163,7 +164,7 @@ def summarise(rows: Episodes, penalty: float) -> dict[str, Any]:
         "crash_ci95": [low, high],
         "crash_upper95": statistics.upper_bound(k, n),
         "danger_mean": danger,
-        "danger_ci95": danger_width,
+        "danger_ci95": danger_width if k else float("nan"),
         "goal_rate": float(rows.goal.mean()),
         "interventions": float(rows.interventions.sum() / steps),
         "insecure": float(rows.insecure.sum() / steps),

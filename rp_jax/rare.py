@@ -161,24 +161,30 @@ def choose_levels(
     stage: Callable[..., Paths],
     share: float = 0.2,
     most: int = 12,
-) -> list[float]:
+) -> tuple[list[float], int]:
     """Levels that about a `share` of the paths reach from one to the next, found by a pilot run.
 
     Use them with other keys: an estimate whose levels come from its own paths is biased.
+
+    Returns:
+        (levels, steps simulated).
     """
     levels: list[float] = []
+    steps = 0
     start_key, key = jax.random.split(key)
     paths = _begin(start_key, pmdp, particles)
     for i in range(most):
         look, play, pick = jax.random.split(jax.random.fold_in(key, i), 3)
         seen = stage(look, paths, pmdp, jnp.asarray(np.inf, pmdp.x.dtype))
+        steps += int(seen.length.sum())
         highest = np.where(np.asarray(seen.crashed), np.inf, np.asarray(seen.highest))
         level = float(np.quantile(highest, 1 - share, method="lower"))
         if not (levels[-1] if levels else 0.0) < level < np.inf:
             break
         levels.append(level)
         paths = stage(play, paths, pmdp, jnp.asarray(level, pmdp.x.dtype))
+        steps += int(paths.length.sum())
         if not bool(paths.reached.any()):
             break
         paths = _resample(pick, paths)
-    return levels
+    return levels, steps

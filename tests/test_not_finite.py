@@ -11,7 +11,12 @@ import probe
 import pytest
 from quick import compile_soon  # noqa: F401
 
+from experiments import pipeline, policy_gradient
 from rp_jax import evaluate, shield
+from rp_jax.baselines.actor_critic import ActorCriticConfig
+from rp_jax.baselines.cpo import CPOConfig
+from rp_jax.baselines.pid_lagrangian import PIDConfig
+from rp_jax.checkpoints import NO_CHECKPOINTS
 from rp_jax.planning import dqn, loop
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.planning.pmdp import encode
@@ -158,6 +163,18 @@ def test_gradients_are_named(wrong, monkeypatch):
     one = dataclasses.replace(CONFIG)
     with pytest.raises(FloatingPointError, match=r"^planning: (weights, after a gradient|losses)"):
         trained(probe.make_pmdp(probe, PARAMS), one)
+
+
+@pytest.mark.parametrize("name", policy_gradient.LEARNERS)
+def test_policy_gradients_stop_at_rewards_that_are_none(name, tmp_path, monkeypatch):
+    """CPO would go on in silence: its line search accepts no step, and its policy stays finite."""
+    env, rollout = paid_with(np.nan), ActorCriticConfig("categorical", 8, 16, minibatches=2)
+    learning = {"CPO": CPOConfig(rollout), "PID-Lagrangian": PIDConfig(rollout)}[name]
+    monkeypatch.setattr(pipeline, "make_pmdp", lambda *_: probe.make_pmdp(env, PARAMS))
+    task = pipeline.Task("corridor", env, PARAMS, {"it": PARAMS}, {}, None)
+    config = pipeline.Config(planning=dataclasses.replace(CONFIG, steps=256))
+    with pytest.raises(FloatingPointError, match=f"^{name}: values' weights"):
+        policy_gradient.learn(name, learning, 0.1, task, config, tmp_path / "it", NO_CHECKPOINTS)
 
 
 @pytest.mark.parametrize("wrong", WRONG[:2])

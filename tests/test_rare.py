@@ -98,7 +98,8 @@ def test_a_path_stops_where_it_reaches_the_level_and_no_later():
 
 def test_levels_of_a_pilot_run_ascend_and_are_left_behind_by_a_share():
     pmdp = make_graded()
-    levels = rare.choose_levels(jax.random.key(5), pmdp, 500, STAGE)
+    levels, steps = rare.choose_levels(jax.random.key(5), pmdp, 500, STAGE)
+    assert steps > 500 * len(levels)
     assert levels == sorted(set(levels))
     assert levels
     assert all(0 < level < 0.6 for level in levels)

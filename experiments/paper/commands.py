@@ -27,6 +27,7 @@ COMMANDS: dict[str, str] = {
     "compare_point_gather": "compare --env point_gather --methods DQN CPO PID {compare}",
     "mpc_circuit_3": "mpc --env circuit --horizon 3 {mpc}",
     "mpc_circuit_4": "mpc --env circuit --horizon 4 {mpc}",
+    "mpc_circuit_5": "mpc --env circuit --horizon 5 --variants default {mpc_few}",
     "mpc_jam_2": "mpc --env jam --horizon 2 {mpc}",
     "mpc_jam_3": "mpc --env jam --horizon 3 {mpc}",
     "mpc_point_gather_1": "mpc --env point_gather --horizon 1 {mpc}",
@@ -66,6 +67,7 @@ SIZES: dict[str, dict[str, str]] = {
         "compare": "--seeds 10 --steps 1200000 --episodes 2000",
         "compare_circuit": "--seeds 10 --steps 1800000 --episodes 2000",
         "mpc": "--episodes 1000",
+        "mpc_few": "--episodes 200",
     },
     "quick": {
         "frozen_lake": "--horizons 100 --no-program",
@@ -86,6 +88,7 @@ SIZES: dict[str, dict[str, str]] = {
         "compare": "--steps 200000 --episodes 1000",
         "compare_circuit": "--steps 200000 --episodes 1000",
         "mpc": "--episodes 50",
+        "mpc_few": "--episodes 5",
     },
 }
 

@@ -79,10 +79,7 @@ def summed_up(rows: Sequence[Row]) -> list[Row]:
 
 def shown(row: Row) -> str:
     """Return and crash rate in words."""
-    return (
-        f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}; "
-        f"{row['crashes']:,} of {row['episodes']:,}: {tables.percent(row)} %"
-    )
+    return f"{tables.earned(row)}; {tables.crashed(row)}: {tables.percent(row)} %"
 
 
 def table(
@@ -98,8 +95,8 @@ def table(
                 "variant": variant,
                 "method": row["method"],
                 "seeds": row["seeds"],
-                "return": f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}",
-                "crashes": f"{row['crashes']:,} of {row['episodes']:,}",
+                "return": tables.earned(row),
+                "crashes": tables.crashed(row),
                 "crash rate, % [95 %]": tables.percent(row),
             }
             if paper:
@@ -186,18 +183,24 @@ def comparisons(
             )
         )
         if kind == "DQN":
-            less = [row for row in others if row["return_mean"] < rp[row["variant"]]["return_mean"]]
+            less = [row for row in others if less_earned(row, rp[row["variant"]])]
             best = max(others, key=lambda r: r["return_mean"] - rp[r["variant"]]["return_mean"])
             found.append(
                 Claim(
                     f"{where}: RP earns more than DQN",
                     "higher return",
-                    f"more than {len(less)} of {len(others)} DQN entries; the nearest: "
+                    f"more than {len(less)} of {len(others)} DQN entries, intervals apart; next: "
                     f"{best['method']}, {best['variant']}: {best['return_mean']:.2f}",
                     holds(len(less) == len(others)),
                 )
             )
     return found
+
+
+def less_earned(one: Row, other: Row) -> bool:
+    """Whether one return is below another, their 95 % intervals apart."""
+    high = one["return_mean"] + one["return_ci95"]
+    return high < other["return_mean"] - other["return_ci95"]
 
 
 def goals(scores: Sequence[Row], env: str) -> Table:

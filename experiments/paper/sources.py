@@ -90,10 +90,12 @@ def locked(path: Path) -> Iterator[int]:
 
 
 def finished(folder: Path) -> bool:
-    """A run is: its last process ended well, or left nothing to resume."""
-    if (folder / LOG).exists():
-        return read(folder / LOG)[-1]["exit"] == 0
-    return _begun(folder) and not resumable(folder)
+    """A run is: its last process ended well, or there is nothing left in it to resume.
+
+    It may have been resumed by itself, of which its log does not tell.
+    """
+    well = (folder / LOG).exists() and read(folder / LOG)[-1]["exit"] == 0
+    return well or (_begun(folder) and not resumable(folder))
 
 
 def resumable(folder: Path) -> bool:

@@ -45,7 +45,7 @@ def tell(results: list[dict[str, Any]]) -> Section:
             "planner": row["planner"],
             "x": f"{row['x']:g}",
             "seeds": row["seeds"],
-            "return": f"{row['return_mean']:.2f} +- {row['return_ci95']:.2f}",
+            "return": tables.earned(row),
             "crash rate, % [95 %]": tables.percent(row),
             "insecure states, %": f"{100 * row['insecure']:.2f}",
         }

@@ -9,58 +9,84 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import console, mpc, pipeline, runs
+from experiments import console, mpc, pipeline, policy_gradient, runs
 from experiments.paper import published
-from experiments.paper.scores import read
+from experiments.paper.scores import RP, RUNS, read
 from experiments.paper.section import EXCEEDED, MISSED, Claim, Section, Table, holds
-from rp_jax.baselines import actor_critic, cpo
+from rp_jax.baselines import actor_critic
+from rp_jax.baselines.cpo import CPOConfig
 from rp_jax.baselines.mpc import Search, make_search
+from rp_jax.planning.pmdp import PMDP
 
 TITLE = "Computation time"
-SEARCHES = {"circuit": (3, 4), "jam": (2, 3)}
+SEARCHES = {"circuit": (3, 4, 5), "jam": (2, 3)}
 VARIANTS = {"jam": "N=8"}  # elsewhere the first
 ROUNDS = 3
+STEPS = 3_000_000  # that the paper's agents learn in
 
 
 def run(sources: Any, folder: Path) -> dict[str, Any]:
     """A row per task and method: wall time of each round; a row per task: of learning."""
     rows, learning = [], []
-    for env, searches in SEARCHES.items():
-        loaded = runs.load(sources(env))
-        trained = read(sources(env) / "training.json")
-        row = {"env": env, "seeds": loaded.config.seeds, "steps": trained["steps"]}
-        learning.append(row | trained["seconds"])
-        subject = loaded.subject(VARIANTS.get(env, ""), 0)
-        timers = timers_of(loaded, subject, searches)
+    for env in SEARCHES:
+        folders = {method: sources(name) for method, name in RUNS[env].items()}
+        own = {method: runs.load(folder) for method, folder in folders.items()}
+        learning.append(learned(own[RP], folders[RP]))
+        timers = timers_of(env, own)
         with console.progress(f"timing, {env}") as bar:
             for i, (method, timer) in enumerate(timers.items()):
                 bar("", i, len(timers), method)
                 seconds = [timer() for _ in range(ROUNDS)]
-                row = {"env": env, "variant": subject.variant, "method": method}
+                variant = VARIANTS.get(env, next(iter(own[RP].task.tests)))
+                row = {"env": env, "variant": variant, "method": method}
                 rows.append({**row, "seconds": seconds})
             bar("", len(timers), len(timers))
     return {"actions": rows, "learning": learning}
 
 
-def timers_of(
-    loaded: runs.Run, subject: runs.Subject, searches: tuple[int, ...]
-) -> dict[str, Callable[[], float]]:
+def learned(run: runs.Run, folder: Path) -> dict[str, Any]:
+    """How long reconnaissance and planning of a run took; `whole`, with the recipe's labels."""
+    trained = read(folder / "training.json")
+    module = runs.EXPERIMENTS[run.task.name]
+    return {
+        "env": run.task.name,
+        "seeds": run.config.seeds,
+        "steps": trained["steps"],
+        "whole": run.task.threats == module.make_task(module.full("tuned")).threats,
+        **trained["seconds"],
+    }
+
+
+def timers_of(env: str, own: dict[str, runs.Run]) -> dict[str, Callable[[], float]]:
     """By method, what plays 100 actions and says how long they took.
 
     The time of a network does not depend on what it has learned, so DQN has RP's weights and CPO
     none of its own. PID-Lagrangian acts as CPO does.
+
+    Args:
+        env: the task.
+        own: runs of RP, by kind.
     """
-    pmdp, network, weights = subject.pmdp, subject.network, subject.weights
-    free = pmdp.replace(threats=None, x=jnp.asarray(jnp.inf))
     key = pipeline.key_of(0, pipeline.EVALUATION)
-    penalty = loaded.config.penalty
-    found: dict[str, Callable[[], float]] = {
-        "RP": lambda: pipeline.action_seconds(pmdp, network, weights),
-        "DQN": lambda: pipeline.action_seconds(free, network, weights),
-        "CPO": lambda: _gaussian_seconds(free),
-    }
-    for steps in searches:
-        search = make_search(pmdp.env, pmdp.params, steps, penalty)  # type: ignore[arg-type]
+    found: dict[str, Callable[[], float]] = {}
+
+    def add(method: str, pmdp: PMDP, policy: Any, weights: Any) -> None:
+        act = pipeline.acting(pmdp, policy, weights)
+        found[method] = lambda: pipeline.action_seconds(key, pmdp.env, pmdp.params, act)[0]
+
+    for method, loaded in own.items():
+        subject = loaded.subject(VARIANTS.get(env, ""), 0)
+        add(method, subject.pmdp, pipeline.greedily(subject.network), subject.weights)
+    subject, penalty = own[RP].subject(VARIANTS.get(env, ""), 0), own[RP].config.penalty
+    free = subject.pmdp.replace(threats=None, x=jnp.asarray(jnp.inf))
+    add("DQN", free, pipeline.greedily(subject.network), subject.weights)
+    actor: Any = actor_critic.make_actor(free, CPOConfig().rollout)
+    start = jax.vmap(free.env.reset, (0, None))(jax.random.split(key, 1), free.params)
+    weights = actor.init(key, free.perceive(start).encoded)
+    add("CPO", free, policy_gradient.modes(CPOConfig(), free), weights)
+    for steps in SEARCHES[env]:
+        model: Any = free.env
+        search = make_search(model, free.params, steps, penalty)
         found[f"MPC ({steps} steps)"] = functools.partial(_search_seconds, key, search)
     return found
 
@@ -68,15 +94,6 @@ def timers_of(
 def _search_seconds(key: jax.Array, search: Search) -> float:
     """Of MPC."""
     return mpc.action_seconds(key, search)[0]
-
-
-def _gaussian_seconds(pmdp: Any) -> float:
-    """Of CPO's policy."""
-    actor: Any = actor_critic.make_actor(pmdp, cpo.CPOConfig().rollout)
-    start = jax.vmap(pmdp.env.reset, (0, None))(jax.random.split(jax.random.key(0), 1), pmdp.params)
-    weights = actor.init(jax.random.key(0), pmdp.perceive(start).encoded)
-    act = jax.jit(lambda weights, states, p: actor.apply(weights, p.perceive(states).encoded).mode)
-    return pipeline.seconds_of_100(lambda: act(weights, start, pmdp))
 
 
 def tell(results: dict[str, Any]) -> Section:
@@ -106,10 +123,11 @@ def tell(results: dict[str, Any]) -> Section:
                     EXCEEDED if seconds < paper else MISSED,
                 )
             )
-    for env, searches in SEARCHES.items():
-        method = f"MPC ({searches[-1]} steps)"
+    for env in dict.fromkeys(row["env"] for row in results["actions"]):
+        paper_of = published.SECONDS[env]
+        (method,) = (name for name in paper_of if name.startswith("MPC"))
         ratio = median[env, method] / median[env, "RP"]
-        theirs = published.SECONDS[env][method] / published.SECONDS[env]["RP"]
+        theirs = paper_of[method] / paper_of["RP"]
         claims.append(
             Claim(
                 f"Computation time, {env}: RP acts faster than {method}",
@@ -132,7 +150,7 @@ def tell(results: dict[str, Any]) -> Section:
 
 
 def _learning(row: dict[str, Any]) -> tuple[dict[str, Any], list[Claim]]:
-    """A line of the table, and the claims on how long it takes."""
+    """A line of the table, and the claims on how long it takes; those of as much work alone."""
     recon = row["reconnaissance"] / 60
     planning = (row["planning"] + row["planning_compilation"]) / 60
     line = {
@@ -143,18 +161,22 @@ def _learning(row: dict[str, Any]) -> tuple[dict[str, Any], list[Claim]]:
         "planning of all seeds, minutes": f"{planning:.1f}",
     }
     most, hours = published.THREAT_MINUTES, published.TRAINING_HOURS
+    as_many = planning / 60 * STEPS / row["steps"]
     claims = [
         Claim(
-            f"Section 5.3, {row['env']}: minutes to learn the threat",
-            f"{most:g}",
-            f"{recon:.1f}",
-            EXCEEDED if recon < most else MISSED,
-        ),
-        Claim(
-            f"Appendix G.1, {row['env']}: hours to plan",
-            f"{hours:g}, one seed, 3M steps, a GPU",
-            f"{planning / 60:.2f}, {row['seeds']} seed(s), {row['steps']:,} steps in all, a CPU",
-            EXCEEDED if planning / 60 < hours else MISSED,
+            f"Appendix G.1, {row['env']}: hours to plan, {STEPS / 1e6:g}M steps of one seed",
+            f"{hours:g}, on a GPU",
+            f"{as_many:.2f} for as many steps, on a CPU ({row['steps']:,} were made)",
+            EXCEEDED if as_many < hours else MISSED,
         ),
     ]
+    if row["whole"]:
+        claims.append(
+            Claim(
+                f"Section 5.3, {row['env']}: minutes to learn the threat",
+                f"{most:g}",
+                f"{recon:.1f}",
+                EXCEEDED if recon < most else MISSED,
+            )
+        )
     return line, claims

@@ -1,4 +1,4 @@
-"""Crashes while learning: all methods, all tasks."""
+"""Danger while learning: all methods, all tasks."""
 
 from pathlib import Path
 from typing import Any
@@ -10,12 +10,15 @@ from experiments.paper.section import Claim, Section, Table, holds
 from rp_jax import statistics
 
 TITLE = "Crashes while learning"
+ALSO = {"point_gather": {"RP, x = .1": "point_gather_x01"}}  # kinds of RP, beside those of tables
+GOES_ON = ("point_gather",)  # after a hit, so that an episode's danger may exceed 1
 
 
 def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
     """A row per task and method: episodes and crashes of all seeds, exploration included."""
     rows = []
     for env, own in scores.RUNS.items():
+        own = own | ALSO.get(env, {})
         files = {method: sources(name) / "metrics.jsonl" for method, name in own.items()}
         histories = {method: scores.read_lines(file) for method, file in files.items()}
         compared = sources(f"compare_{env}")
@@ -27,6 +30,8 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
                 sum(row.get(key, 0) for row in history)
                 for key in ("episodes", "crashes", "inadmissible")
             )
+            # Where a crash ends the episode, crashes are its danger.
+            met: list[float] = [row["danger" if "danger" in row else "crashes"] for row in history]
             rows.append(
                 {
                     "env": env,
@@ -34,6 +39,7 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
                     "seeds": len({row["seed"] for row in history}),
                     "episodes": episodes,
                     "crashes": crashes,
+                    "danger": sum(met) / max(1, episodes),
                     "crash_rate": crashes / max(1, episodes),
                     "crash_ci95": statistics.clopper_pearson(crashes, max(1, episodes)),
                     "inadmissible": inadmissible if method.startswith("RP") else None,
@@ -51,6 +57,7 @@ def tell(results: list[dict[str, Any]]) -> Section:
             "seeds": row["seeds"],
             "crashes": f"{row['crashes']:,} in {row['episodes']:,} episodes",
             "rate, % [95 %]": tables.percent(row),
+            "danger an episode": f"{row['danger']:.2g}",
             "inadmissible actions": "" if row["inadmissible"] is None else row["inadmissible"],
         }
         for row in results
@@ -58,9 +65,10 @@ def tell(results: list[dict[str, Any]]) -> Section:
     claims = [
         Claim(
             f"Section 1, {row['env']}, {row['method']}: the learning process is safe",
-            f"crash rate below c = {published.LIMITS[row['env']]:g}",
-            f"{row['crashes']:,} crashes in {row['episodes']:,} episodes: {tables.percent(row)} %",
-            holds(row["crash_ci95"][1] <= published.LIMITS[row["env"]]),
+            f"danger of an episode below c = {published.LIMITS[row['env']]:g}",
+            f"{row['danger']:.2g}; crashes in {tables.crashed(row)} episodes: "
+            f"{tables.percent(row)} %",
+            holds(_keeps(row)),
         )
         for row in results
         if row["method"].startswith("RP")
@@ -71,3 +79,9 @@ def tell(results: list[dict[str, Any]]) -> Section:
         tables=[Table("Crashes while learning", lines)],
         claims=claims,
     )
+
+
+def _keeps(row: dict[str, Any]) -> bool:
+    """Whether c is kept: by the whole interval, or, where danger is no probability, the mean."""
+    found = row["danger"] if row["env"] in GOES_ON else row["crash_ci95"][1]
+    return bool(found <= published.LIMITS[row["env"]])

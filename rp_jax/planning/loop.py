@@ -276,10 +276,11 @@ def _store(state: LoopState, config: LoopConfig) -> Any:
     if config.n_step == 1:
         return new
     filling = state.iteration < 0
-    return new.replace(
-        current_index=jnp.where(filling, old.current_index, new.current_index),
-        is_full=jnp.where(filling, old.is_full, new.is_full),
-    )
+    places = ["current_index", "is_full"]
+    if config.prioritised:
+        places.append("running_index")  # of the priorities
+    back = {name: jnp.where(filling, getattr(old, name), getattr(new, name)) for name in places}
+    return new.replace(**back)
 
 
 def collect(state: LoopState, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics]:

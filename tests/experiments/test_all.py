@@ -40,13 +40,14 @@ class Runs:
         folder.mkdir(exist_ok=True)
         stops = folder.name in self.stops
         self.stops.discard(folder.name)
-        storage.write_json(folder / "config.json", {"experiment": "it"})
+        status = 130 if stops else self.exits.get(folder.name, 0)
+        if status != 2:  # which is bad input, before anything is written
+            storage.write_json(folder / "config.json", {"experiment": "it"})
         checkpoints = folder / settings.CHECKPOINTS
         if stops:
             checkpoints.mkdir()
         elif checkpoints.exists():
             checkpoints.rmdir()
-        status = 130 if stops else self.exits.get(folder.name, 0)
         return {"exit": status, "interrupted": stops, "seconds": 2.0, "cpu_seconds": 60.0}
 
 
@@ -98,6 +99,17 @@ def test_a_run_that_ended_after_its_parent_is_finished(runs, tmp_path):
     storage.write_json(tmp_path / "jam" / "config.json", {"experiment": "experiments.jam"})
     module.Sources(tmp_path, "quick")("jam")
     assert runs.commands == []
+
+
+def test_an_interrupted_run_that_was_resumed_by_itself_is_finished(runs, tmp_path):
+    runs.stops.add("jam")
+    with pytest.raises(KeyboardInterrupt):
+        module.Sources(tmp_path, "quick")("jam")
+    (tmp_path / "jam" / settings.CHECKPOINTS).rmdir()  # as experiments.jam --resume leaves it
+    (tmp_path / "jam" / "table.json").touch()
+    module.Sources(tmp_path, "quick")("jam")
+    assert len(runs.commands) == 1
+    assert (tmp_path / "jam" / "table.json").exists()
 
 
 def test_a_run_that_another_process_makes_is_left_alone(runs, tmp_path):
@@ -152,7 +164,7 @@ def test_one_failure_is_named_and_stops_no_other(runs, tmp_path, monkeypatch, ca
     assert json.loads((out / "third" / "results.json").read_text()) == {"value": 3}
     text = (out / "REPORT.md").read_text()
     assert "Preset quick" in text
-    assert "2 published claims: 2 reproduced" in text
+    assert "2 verdicts: 2 reproduced" in text
     assert "second: OSError: no disk" in text
     assert "![a picture](first/one.png)" in text
     assert "| 3 | <&> |" in text
@@ -166,7 +178,7 @@ def test_one_failure_is_named_and_stops_no_other(runs, tmp_path, monkeypatch, ca
     (out / "first" / "one.png").unlink()
     assert everything.main(["--resume", str(out)]) == out
     assert (out / "first" / "one.png").exists()
-    assert "3 published claims" in (out / "REPORT.md").read_text()
+    assert "3 verdicts" in (out / "REPORT.md").read_text()
     assert len(runs.commands) == 1
 
 
@@ -263,6 +275,7 @@ def test_trajectories_of_three_methods(circuit_runs, tmp_path, monkeypatch):
 def test_all_methods_are_timed_in_one_process(circuit_runs, tmp_path, monkeypatch):
     monkeypatch.setattr(timing, "SEARCHES", {"circuit": (1, 4)})
     monkeypatch.setattr(timing, "ROUNDS", 1)
+    monkeypatch.setattr(timing, "RUNS", {"circuit": {"RP": "circuit"}})
     monkeypatch.setattr(timing.mpc, "action_seconds", lambda key, search: (search.horizon, 0.0))
     results = timing.run(circuit_runs, tmp_path)
     found = {row["method"]: row["seconds"] for row in results["actions"]}
@@ -272,6 +285,12 @@ def test_all_methods_are_timed_in_one_process(circuit_runs, tmp_path, monkeypatc
     assert {row["variant"] for row in results["actions"]} == {"circle"}
     claims = {claim.claim: claim for claim in timing.tell(results).claims}
     assert claims["Computation time, circuit: MPC (4 steps), 100 actions"].verdict == "exceeded"
+    assert not results["learning"][0]["whole"]  # so few labels took no time to speak of
+    assert not any("learn the threat" in claim for claim in claims)
+    steps, took = (results["learning"][0][k] for k in ("steps", "planning"))
+    took += results["learning"][0]["planning_compilation"]
+    (planned,) = (claims[claim] for claim in claims if "hours to plan" in claim)
+    assert planned.ours.startswith(f"{took / 3600 * 3e6 / steps:.2f} for as many")
 
 
 def test_walls_jointly_are_never_more_threatening_than_summed():

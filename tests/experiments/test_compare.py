@@ -45,7 +45,11 @@ def test_every_method_has_its_rows(finished, tmp_path, monkeypatch, capsys):
         text = (out / name / "metrics.jsonl").read_text()
         history = [json.loads(line) for line in text.splitlines()]
         dqn = json.loads((out / "dqn" / "metrics.jsonl").read_text().splitlines()[0])
-        assert set(history[0]) == set(dqn) - {"insecure", "inadmissible", "loss"}
+        own = {"cpo": {"kl", "recoveries", "accepted"}, "pid": {"multiplier"}}[name]
+        assert set(history[0]) == set(dqn) - {"insecure", "inadmissible", "loss"} | own
+        if name == "cpo":
+            assert all(0 <= line[k] <= 1 for line in history for k in own)
+            assert any(line["accepted"] > 0 for line in history)
         steps = [line["steps"] for line in history]
         assert steps == sorted(set(steps))
         (mine,) = {

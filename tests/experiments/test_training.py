@@ -1,7 +1,6 @@
 """Training runs in chunks, with a learner that only counts."""
 
 import json
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -9,14 +8,7 @@ import pytest
 from experiments import console, training
 from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
 
-
-class Sums(NamedTuple):
-    steps: np.ndarray
-    episodes: np.ndarray
-    score: np.ndarray
-    danger: np.ndarray
-    crashes: np.ndarray
-    goals: np.ndarray
+COUNTED = ("steps", "episodes", "score", "danger", "crashes", "goals")
 
 
 MEMBERS = [training.Member(3, 0.1, 0.0), training.Member(4, 0.1, 0.0)]
@@ -32,13 +24,14 @@ def test_chunks_hold_all_units_and_few_more(units):
 def learn(folder, checkpoints=NO_CHECKPOINTS, chunks=4, fails_at=None):
     """Member i has i episodes a chunk, each of 10 points and half a crash."""
     each = np.asarray([0.0, 1.0], np.float32)
-    blank = Sums(*(np.zeros((chunks, 2), np.float32) for _ in Sums._fields))
+    blank = {name: np.zeros((chunks, 2), np.float32) for name in COUNTED}
 
     def step(i, state):
-        return state + 1, Sums(each + 5, each, 10 * each, each / 2, each, 0 * each)
+        sums = (each + 5, each, 10 * each, each / 2, each, 0 * each)
+        return state + 1, dict(zip(COUNTED, sums, strict=True))
 
     def check(weights, sums):
-        assert sums.steps.shape == (2,)
+        assert sums["steps"].shape == (2,)
         if weights == fails_at:
             raise FloatingPointError(f"chunk {fails_at}")
 

@@ -411,6 +411,20 @@ def test_the_paper_s_network_learns_from_the_smallest_prioritised_replay(compile
     assert len(np.unique(leaves)) > 20
 
 
+@pytest.mark.parametrize("n_step", [1, 3])
+def test_priorities_stand_where_transitions_do(n_step, compile_soon):
+    config = dataclasses.replace(
+        CONFIG, n_step=n_step, replay=128, replay_start=33, prioritised=True
+    )
+    pmdp = probe.make_pmdp(probe, PARAMS, 0.5)
+    state, _ = start(jax.random.key(11), pmdp, config)
+    tree = state.replay.sum_tree_state
+    leaves = np.asarray(tree.nodes)[2**tree.tree_depth - 1 :][:128]
+    assert (leaves[:64] > 0).all()  # two steps of 32 environments are stored
+    assert (leaves[64:] == 0).all()
+    assert state.replay.current_index == state.replay.running_index == 64
+
+
 def test_exploration_falls_to_its_end_and_stays():
     config = dataclasses.replace(CONFIG, explore_from=0.8, explore_to=0.2, explore_share=0.5)
     assert config.iterations == 200
