@@ -93,7 +93,7 @@ def fisher_product(
 
 
 def step_lengths(
-    q: Array, r: Array, s: Array, excess: Array, delta: float
+    q: Array, r: Array, s: Array, excess: Array, delta: float, reach: Array | None = None
 ) -> tuple[Array, Array, Array]:
     """Solves max g'x subject to excess + b'x <= 0 and x'Hx / 2 <= delta, by its dual.
 
@@ -108,19 +108,23 @@ def step_lengths(
         s: () b'w.
         excess: () by how much the constraint is violated; negative where it is kept.
         delta: radius of the trust region.
+        reach: () what to take for s where it is asked whether a step of the region keeps the
+            constraint; s if not given.
 
     Returns:
         (along, against, case).
     """
+    reach = s if reach is None else reach
     free = jnp.sqrt(2 * delta / jnp.maximum(q, TINY))
     slope = r / jnp.maximum(s, TINY)
     left = 2 * delta - excess * excess / jnp.maximum(s, TINY)  # of the region, on the constraint
+    beyond = excess * excess / jnp.maximum(reach, TINY) - 2 * delta
     gain = jnp.maximum(q - r * slope, TINY)  # of reward along the constraint
     bound = jnp.sqrt(jnp.maximum(left, 0.0) / gain)
     case = jnp.where(
         excess + free * r <= 0,
         UNCONSTRAINED,
-        jnp.where((excess > 0) & (left < 0), RECOVERY, CONSTRAINED),
+        jnp.where((excess > 0) & (beyond > 0), RECOVERY, CONSTRAINED),
     )
     along = jnp.stack([free, bound, jnp.zeros_like(free)])
     against = jnp.stack(
@@ -137,6 +141,12 @@ def improve(
     params: Any, network: nn.Module, batch: Batch, excess: Array, config: CPOConfig
 ) -> tuple[Any, Update]:
     """One update of the policy (their Algorithm 1). To be compiled with `compiler_options`.
+
+    s = b'H^-1 b says how far a step can lower the danger, and noise in b adds to it: where crashes
+    are rare, a step would seem to keep a constraint that it does not come near to, and the danger
+    would stay. So whether to recover is decided with b of two halves of the batch, b1'H^-1 b2,
+    which noise does not raise; rows of the halves alternate, so they are of different environments
+    if the number of these is even.
 
     Args:
         params: of the policy.
@@ -159,13 +169,19 @@ def improve(
         ratio = jnp.exp(policy(theta).log_prob(batch.action) - before)
         return jnp.mean(ratio[:, None] * advantage, axis=0)
 
+    def dangers(theta: Array) -> Array:
+        """(2,) how danger per step changes, by the even and by the odd rows."""
+        change = jnp.exp(policy(theta).log_prob(batch.action) - before) * advantage[:, DANGER]
+        return jnp.stack([jnp.mean(change[::2]), jnp.mean(change[1::2])])
+
     def divergence(theta: Array) -> Array:
         return jnp.mean(old.kl(policy(theta)))
 
     g, b = jax.jacrev(surrogates)(theta)
+    even, odd = jax.jacrev(dangers)(theta)
     product = fisher_product(policy, theta, config.damping)
-    v, w = (cg(product, a, tol=ENOUGH, maxiter=config.products)[0] for a in (g, b))
-    along, against, case = step_lengths(g @ v, g @ w, b @ w, excess, config.divergence)
+    v, w, u = (cg(product, a, tol=ENOUGH, maxiter=config.products)[0] for a in (g, b, even))
+    along, against, case = step_lengths(g @ v, g @ w, b @ w, excess, config.divergence, odd @ u)
     direction = along * v - against * w
 
     def attempt(carry):

@@ -127,6 +127,23 @@ def test_the_dual_s_solution_is_that_of_a_solver(x64):
     assert set(met) == {*both, (CONSTRAINED, False), (RECOVERY, True)}
 
 
+@pytest.mark.parametrize("noise", [True, False])
+def test_noise_does_not_pass_for_a_way_to_less_danger(noise, compile_soon):
+    """The same excess is within reach where danger depends on the action, and else is not."""
+    recoveries = 0
+    for seed in range(8):
+        network, params, batch = policy_and_batch("gaussian", rows=400, seed=seed)
+        danger = batch.advantage[:, DANGER] if noise else batch.action[:, 0]
+        advantage = batch.advantage.at[:, DANGER].set(danger / jnp.std(danger))
+        rng = np.random.default_rng(seed)
+        fresh = jnp.asarray(rng.normal(size=(400, 2)), float)  # of reward, and of danger if noise
+        advantage = fresh if noise else advantage
+        batch = batch._replace(advantage=advantage)
+        _, update = improve(params, network, batch, jnp.asarray(0.03), CONFIG)
+        recoveries += int(update.case == RECOVERY)
+    assert recoveries >= 6 if noise else recoveries == 0
+
+
 @pytest.mark.parametrize("excess", [-0.1, 0.0, 0.1])
 def test_vanishing_gradients_give_finite_steps(excess):
     nothing, some = jnp.zeros(()), jnp.asarray(2.0)
