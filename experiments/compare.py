@@ -97,22 +97,17 @@ def by_q_learning(
 
 
 def by_policy_gradient(
-    name: str,
-    learning: Any,
-    limit: float,
+    method: policy_gradient.Method,
     task: pipeline.Task,
     config: Any,
     folder: Path,
     checkpoints: Checkpoints,
 ) -> list[dict[str, Any]]:
     """Rows of CPO or PID-Lagrangian PPO."""
-    at = checkpoints.at("planning")
-    trained = policy_gradient.learn(name, learning, limit, task, config, folder, at)
-    pmdp, members = pipeline.make_pmdp(task, config, None, task.train), pipeline.members_of(config)
-    policy = policy_gradient.modes(learning, pmdp)
-    agents = pipeline.Agents(members, [name] * len(members), policy, trained)
+    pmdp = pipeline.make_pmdp(task, config, None, task.train)
+    agents = policy_gradient.learn(method, pmdp, config, folder, checkpoints.at("planning"))
     rows = pipeline.evaluate_all(task, config, pmdp, agents, checkpoints.at("evaluation"))
-    return with_learning(rows, trained)
+    return with_learning(rows, agents.trained)
 
 
 def with_learning(
@@ -168,7 +163,8 @@ def run(
     for method, (name, learning) in on_policy.items():
         if method in config.methods:
             out, at = folder / method.lower(), checkpoints.at(method.lower())
-            add(by_policy_gradient(name, learning, limit, task, settings, out, at))
+            learner = policy_gradient.Method(name, learning, limit)
+            add(by_policy_gradient(learner, task, settings, out, at))
     if "MPC" in config.methods:
         add(by_search(config, horizon))
     return rows

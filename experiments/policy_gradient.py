@@ -4,7 +4,7 @@ import functools
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.flatten_util
@@ -19,30 +19,24 @@ from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import finite
 
 LEARNERS: Mapping[str, Any] = {"CPO": cpo, "PID-Lagrangian": pid_lagrangian}
-UPDATES = (
-    "kl",
-    "recoveries",
-    "accepted",
-    "multiplier",
-)  # columns of metrics.jsonl, if they have it
+
+
+class Method(NamedTuple):
+    """What learns, and under which constraint."""
+
+    name: str  # in `LEARNERS`
+    learning: Any  # configuration of the learner
+    limit: float  # c
 
 
 def learn(
-    name: str,
-    learning: Any,
-    limit: float,
-    task: pipeline.Task,
-    config: Any,
-    folder: Path,
-    checkpoints: Checkpoints,
-) -> training.Trained:
-    """Trains all seeds as one program; writes metrics.jsonl as it goes.
+    method: Method, pmdp: PMDP, config: Any, folder: Path, checkpoints: Checkpoints
+) -> pipeline.Agents:
+    """Trains all seeds as one program; writes metrics.jsonl as it goes. They act by their modes.
 
     Args:
-        name: of the method, in `LEARNERS`.
-        learning: its configuration.
-        limit: c.
-        task: what is learned.
+        method: what learns.
+        pmdp: without threats.
         config: the task's settings.
         folder: for metrics.jsonl, created if missing.
         checkpoints: of the learning.
@@ -50,8 +44,9 @@ def learn(
     Raises:
         FloatingPointError: something that was learned is not a finite number.
     """
+    name, learning, limit = method
     learner, members = LEARNERS[name], pipeline.members_of(config)
-    pmdp = pipeline.make_pmdp(task, config, None, task.train)
+    names = [name] * len(members)
     chunks, length = training.chunks_of(-(-config.planning.steps // learning.rollout.steps))
     folder.mkdir(exist_ok=True)
 
@@ -64,7 +59,8 @@ def learn(
         return state, jax.tree.map(lambda m: jnp.sum(m, axis=0), metrics)
 
     def more(sums: Mapping[str, float]) -> dict[str, Any]:
-        return {key: sums[key] / length for key in UPDATES if key in sums}
+        counted = actor_critic.Metrics._fields
+        return {key: value / length for key, value in sums.items() if key not in counted}
 
     with console.progress(name) as bar:
         bar("", 0, chunks, "compiling")
@@ -93,7 +89,7 @@ def learn(
 
         shapes = jax.eval_shape(jitted, state, pmdp, c)[1]
         params, rows, seconds = training.learn(
-            training.Learners(members, [name] * len(members), config.penalty, folder, more),
+            training.Learners(members, names, config.penalty, folder, more),
             state,
             {key: np.zeros((chunks, *s.shape), s.dtype) for key, s in shapes.items()},
             step,
@@ -102,7 +98,8 @@ def learn(
             bar,
             checkpoints,
         )
-    return training.Trained(params, rows, seconds, compiled - began)
+    trained = training.Trained(params, rows, seconds, compiled - began)
+    return pipeline.Agents(members, names, modes(learning, pmdp), trained)
 
 
 def carried(state: Any) -> actor_critic.State:

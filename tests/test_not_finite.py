@@ -166,15 +166,14 @@ def test_gradients_are_named(wrong, monkeypatch):
 
 
 @pytest.mark.parametrize("name", policy_gradient.LEARNERS)
-def test_policy_gradients_stop_at_rewards_that_are_none(name, tmp_path, monkeypatch):
+def test_policy_gradients_stop_at_rewards_that_are_none(name, tmp_path):
     """CPO would go on in silence: its line search accepts no step, and its policy stays finite."""
     env, rollout = paid_with(np.nan), ActorCriticConfig("categorical", 8, 16, minibatches=2)
     learning = {"CPO": CPOConfig(rollout), "PID-Lagrangian": PIDConfig(rollout)}[name]
-    monkeypatch.setattr(pipeline, "make_pmdp", lambda *_: probe.make_pmdp(env, PARAMS))
-    task = pipeline.Task("corridor", env, PARAMS, {"it": PARAMS}, {}, None)
+    method, pmdp = policy_gradient.Method(name, learning, 0.1), probe.make_pmdp(env, PARAMS)
     config = pipeline.Config(planning=dataclasses.replace(CONFIG, steps=256))
     with pytest.raises(FloatingPointError, match=f"^{name}: values' weights"):
-        policy_gradient.learn(name, learning, 0.1, task, config, tmp_path / "it", NO_CHECKPOINTS)
+        policy_gradient.learn(method, pmdp, config, tmp_path / "it", NO_CHECKPOINTS)
 
 
 @pytest.mark.parametrize("wrong", WRONG[:2])

@@ -15,7 +15,7 @@ from experiments.paper.scores import RP, RUNS, read
 from experiments.paper.section import EXCEEDED, MISSED, Claim, Section, Table, holds
 from rp_jax.baselines import actor_critic
 from rp_jax.baselines.cpo import CPOConfig
-from rp_jax.baselines.mpc import Search, make_search
+from rp_jax.baselines.mpc import make_search
 from rp_jax.planning.pmdp import PMDP
 
 TITLE = "Computation time"
@@ -36,7 +36,7 @@ def run(sources: Any, folder: Path) -> dict[str, Any]:
         with console.progress(f"timing, {env}") as bar:
             for i, (method, timer) in enumerate(timers.items()):
                 bar("", i, len(timers), method)
-                seconds = [timer() for _ in range(ROUNDS)]
+                seconds = [timer()[0] for _ in range(ROUNDS)]
                 variant = VARIANTS.get(env, next(iter(own[RP].task.tests)))
                 row = {"env": env, "variant": variant, "method": method}
                 rows.append({**row, "seconds": seconds})
@@ -57,8 +57,8 @@ def learned(run: runs.Run, folder: Path) -> dict[str, Any]:
     }
 
 
-def timers_of(env: str, own: dict[str, runs.Run]) -> dict[str, Callable[[], float]]:
-    """By method, what plays 100 actions and says how long they took.
+def timers_of(env: str, own: dict[str, runs.Run]) -> dict[str, Callable[[], tuple[float, float]]]:
+    """By method, what plays 100 actions and says how long they took: (wall, CPU) time.
 
     The time of a network does not depend on what it has learned, so DQN has RP's weights and CPO
     none of its own. PID-Lagrangian acts as CPO does.
@@ -68,11 +68,12 @@ def timers_of(env: str, own: dict[str, runs.Run]) -> dict[str, Callable[[], floa
         own: runs of RP, by kind.
     """
     key = pipeline.key_of(0, pipeline.EVALUATION)
-    found: dict[str, Callable[[], float]] = {}
+    found: dict[str, Callable[[], tuple[float, float]]] = {}
 
     def add(method: str, pmdp: PMDP, policy: Any, weights: Any) -> None:
         act = pipeline.acting(pmdp, policy, weights)
-        found[method] = lambda: pipeline.action_seconds(key, pmdp.env, pmdp.params, act)[0]
+        time = pipeline.action_seconds
+        found[method] = functools.partial(time, key, pmdp.env, pmdp.params, act)
 
     for method, loaded in own.items():
         subject = loaded.subject(VARIANTS.get(env, ""), 0)
@@ -87,13 +88,8 @@ def timers_of(env: str, own: dict[str, runs.Run]) -> dict[str, Callable[[], floa
     for steps in SEARCHES[env]:
         model: Any = free.env
         search = make_search(model, free.params, steps, penalty)
-        found[f"MPC ({steps} steps)"] = functools.partial(_search_seconds, key, search)
+        found[f"MPC ({steps} steps)"] = functools.partial(mpc.action_seconds, key, search)
     return found
-
-
-def _search_seconds(key: jax.Array, search: Search) -> float:
-    """Of MPC."""
-    return mpc.action_seconds(key, search)[0]
 
 
 def tell(results: dict[str, Any]) -> Section:

@@ -117,14 +117,14 @@ def step_lengths(
     reach = s if reach is None else reach
     free = jnp.sqrt(2 * delta / jnp.maximum(q, TINY))
     slope = r / jnp.maximum(s, TINY)
-    left = 2 * delta - excess * excess / jnp.maximum(s, TINY)  # of the region, on the constraint
-    beyond = excess * excess / jnp.maximum(reach, TINY) - 2 * delta
+    # Of the region, on the constraint.
+    left, surely = (2 * delta - excess * excess / jnp.maximum(a, TINY) for a in (s, reach))
     gain = jnp.maximum(q - r * slope, TINY)  # of reward along the constraint
     bound = jnp.sqrt(jnp.maximum(left, 0.0) / gain)
     case = jnp.where(
         excess + free * r <= 0,
         UNCONSTRAINED,
-        jnp.where((excess > 0) & (beyond > 0), RECOVERY, CONSTRAINED),
+        jnp.where((excess > 0) & (surely < 0), RECOVERY, CONSTRAINED),
     )
     along = jnp.stack([free, bound, jnp.zeros_like(free)])
     against = jnp.stack(
