@@ -52,7 +52,7 @@ def train(config: Config) -> Iterator[dict[str, float]]:
     Raises:
         FloatingPointError: something is no longer a finite number.
     """
-    task, settings = setups.tasks()[config.env]
+    task, settings = setups.quick_tasks()[config.env]
     pmdp = setups.pmdp_of(task, settings)
     learning = dataclasses.replace(settings.planning, steps=config.steps)
     traces = 0
@@ -98,7 +98,7 @@ def summary(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
 def main() -> None:
     """Exits with 1 if an inadmissible action was taken or something was compiled again."""
     config = tyro.cli(Config, prog="python -m benchmarks.endurance", description=__doc__)
-    one_of("env", config.env, setups.tasks())
+    one_of("env", config.env, setups.quick_tasks())
     number("minutes", config.minutes, above=0)
     number("steps", config.steps, least=1, integer=True)
     rows: list[dict[str, float]] = []

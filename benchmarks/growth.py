@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks import env_step, seeds, train_step
 from benchmarks.measure import Row
 from benchmarks.report import machine
-from benchmarks.setups import pmdp_of, tasks
+from benchmarks.setups import pmdp_of, quick_tasks
 from experiments import console
 from rp_jax import storage
 from rp_jax.envs import jam
@@ -88,7 +88,7 @@ def obstacles(sizes: Sequence[int] = OBSTACLES) -> Series:
 
 def side_by_side(sizes: Sequence[int] = SEEDS) -> Series:
     """A step of all environments of all runs, learning included."""
-    _, config = seeds.tasks()["jam"]
+    _, config = seeds.quick_tasks()["jam"]
     units = config.planning.num_envs
     rows = seeds.run(tuple(sizes))
     return series("training loop, Jam", "seeds", "iteration of all", sizes, rows, units)
@@ -96,7 +96,7 @@ def side_by_side(sizes: Sequence[int] = SEEDS) -> Series:
 
 def replay(sizes: Sequence[int] = REPLAYS) -> Series:
     """A step of all environments, learning included."""
-    task, config = tasks()["jam"]
+    task, config = quick_tasks()["jam"]
     pmdp, rows = pmdp_of(task, config), []
     for size in sizes:
         planning = dataclasses.replace(config.planning, replay=size)

@@ -5,8 +5,8 @@ import jax
 from benchmarks.bound import Piece
 from benchmarks.measure import Row, measure
 from benchmarks.report import main
-from benchmarks.setups import more_chunks, pmdp_of, tasks
-from experiments import pipeline, training
+from benchmarks.setups import more_chunks, pmdp_of, quick_tasks
+from experiments import tasks, training
 from rp_jax.planning import loop
 
 ITERATIONS = 25
@@ -14,16 +14,16 @@ ITERATIONS = 25
 
 def run(counts: tuple[int, ...] = (1, 2, 4, 8, 16)) -> list[Row]:
     """The loop on Jam, vmapped over seeds; the batch is their number."""
-    task, config = tasks()["jam"]
+    task, config = quick_tasks()["jam"]
     one, planning = pmdp_of(task, config), config.planning
     rows = []
     for count in counts:
         members = [
             training.Member(seed, config.x, config.learning_penalty) for seed in range(count)
         ]
-        pmdp, axes = pipeline.side_by_side(one, members)
+        pmdp, axes = tasks.side_by_side(one, members)
         init = jax.jit(jax.vmap(loop.init, (0, axes, None)), static_argnums=2)
-        state, _ = init(pipeline.keys_of(members, pipeline.PLANNING), pmdp, planning)
+        state, _ = init(tasks.keys_of(members, tasks.PLANNING), pmdp, planning)
 
         def program(state, pmdp, iterations=ITERATIONS, axes=axes):
             chunk = jax.vmap(loop.chunk, (0, axes, None, None))

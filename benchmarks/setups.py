@@ -8,14 +8,14 @@ import jax.numpy as jnp
 from benchmarks.bound import Piece
 from experiments import circuit as circuit_experiment
 from experiments import jam as jam_experiment
-from experiments import pipeline
 from experiments import point_gather as point_gather_experiment
+from experiments import tasks
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.recon import sampling
 from rp_jax.threat import fit, total
 
 
-def tasks() -> dict[str, tuple[pipeline.Task, pipeline.Config]]:
+def quick_tasks() -> dict[str, tuple[tasks.Task, tasks.Config]]:
     """The tasks with their quick settings."""
     found = {}
     for module in (circuit_experiment, jam_experiment, point_gather_experiment):
@@ -25,7 +25,7 @@ def tasks() -> dict[str, tuple[pipeline.Task, pipeline.Config]]:
     return found
 
 
-def pmdp_of(task: pipeline.Task, config: pipeline.Config) -> PMDP:
+def pmdp_of(task: tasks.Task, config: tasks.Config) -> PMDP:
     """The task's P-MDP. The models are fitted for 200 steps on uniform noise around zero threat,
     so that actions are admissible at a plausible rate; their size is that of the tuned recipe."""
     models = {}
@@ -38,7 +38,7 @@ def pmdp_of(task: pipeline.Task, config: pipeline.Config) -> PMDP:
         model, state = fit.init(jax.random.key(2), sub, data, settings)
         state, _ = fit.run(model, state, data, settings, 200)
         models[kind] = model.replace(params=state.params)
-    return pipeline.make_pmdp(task, config, models, task.train)
+    return tasks.make_pmdp(task, config, models, task.train)
 
 
 def inside(pmdp: PMDP, states: Any) -> dict[str, int]:

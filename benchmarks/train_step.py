@@ -5,7 +5,7 @@ import jax
 from benchmarks.bound import Piece
 from benchmarks.measure import Row, measure, recount
 from benchmarks.report import main
-from benchmarks.setups import more_chunks, pmdp_of, tasks
+from benchmarks.setups import more_chunks, pmdp_of, quick_tasks
 from rp_jax.planning import loop
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.planning.pmdp import PMDP
@@ -32,7 +32,7 @@ def row(title: str, pmdp: PMDP, planning: LoopConfig) -> Row:
 def run() -> list[Row]:
     """Acting, environment, observation, threat, replay and learning, tuned recipe."""
     rows = []
-    for name, (task, config) in tasks().items():
+    for name, (task, config) in quick_tasks().items():
         samples = config.planning.samples_per_step
         found = row(f"{name}, {samples:g} samples a step", pmdp_of(task, config), config.planning)
         rows += [found, recount(found, "samples", samples)]

@@ -7,14 +7,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from experiments import cli, console, pipeline, tables, training
+from experiments import cli, console, pipeline, reconnaissance, tables, tasks, training
 from rp_jax import evaluate, storage
 from rp_jax.checkpoints import Checkpoints
 
 RANDOM = 100  # stream of random numbers, apart from the pipeline's
 
 
-def members_of(config: pipeline.Config) -> list[training.Member]:
+def members_of(config: tasks.Config) -> list[training.Member]:
     """Of each seed: no shield; no shield, but danger penalised; the shield."""
     cases = [(float("inf"), 0.0), (float("inf"), config.penalty), (config.x, 0.0)]
     seeds = range(config.seed, config.seed + config.seeds)
@@ -22,10 +22,10 @@ def members_of(config: pipeline.Config) -> list[training.Member]:
 
 
 def at_random(
-    task: pipeline.Task, config: pipeline.Config, models: Mapping[str, Any]
+    task: tasks.Task, config: tasks.Config, models: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
     """One row per variant for all actions alike, and for all admissible actions alike."""
-    key = pipeline.key_of(config.seed, RANDOM)
+    key = tasks.key_of(config.seed, RANDOM)
 
     def policy(key: jax.Array, percept: Any) -> tuple[jax.Array, jax.Array]:
         values = jax.random.uniform(key, percept.threat.shape)
@@ -39,7 +39,7 @@ def at_random(
     rows = []
     for variant, params in task.tests.items():
         for x in (float("inf"), config.x):
-            pmdp = pipeline.make_pmdp(task, config, models, params)
+            pmdp = tasks.make_pmdp(task, config, models, params)
             found = evaluate.summarise(play(pmdp.replace(x=jnp.float32(x))), config.penalty)
             method = "random" if x == float("inf") else f"random, shield (x={x:g})"
             rows.append({"variant": variant, "method": method, "x": x, "seed": config.seed} | found)
@@ -62,15 +62,13 @@ def show(name: str, rows: Sequence[Mapping[str, Any]]) -> None:
     console.table(name, shown, list(shown[0]))
 
 
-def run(
-    task: pipeline.Task, config: pipeline.Config, folder: Path, checkpoints: Checkpoints
-) -> None:
+def run(task: tasks.Task, config: tasks.Config, folder: Path, checkpoints: Checkpoints) -> None:
     """The comparison, into a prepared folder: table.json and learning_curves.png."""
-    models, _, _ = pipeline.learn_threats(task, config, folder, checkpoints)
+    models, _, _ = reconnaissance.learn_threats(task, config, folder, checkpoints)
     if models is None:
         with cli.bad_input():
             raise ValueError("x is inf; it must be finite where the shield is to be compared")
-    pmdp, members = pipeline.make_pmdp(task, config, models, task.train), members_of(config)
+    pmdp, members = tasks.make_pmdp(task, config, models, task.train), members_of(config)
     trained, found = pipeline.plan_and_evaluate(task, config, pmdp, members, folder, checkpoints)
     rows = at_random(task, config, models) + found
     rows.sort(key=lambda row: list(task.tests).index(row["variant"]))

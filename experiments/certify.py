@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 
 import rp_jax
-from experiments import cli, console, pipeline, runs
+from experiments import cli, console, runs, tasks
 from rp_jax import evaluate, statistics, storage
 from rp_jax.validate import number
 
@@ -61,7 +61,7 @@ def run(config: Config) -> dict[str, Any]:
         values = evaluate.greedy(network, params)
         return evaluate.run_episodes(key, pmdp, values, episodes, batch=episodes).danger
 
-    key = pipeline.key_of(config.seed, pipeline.CERTIFICATE)
+    key = tasks.key_of(config.seed, tasks.CERTIFICATE)
     size, began = min(ROUND, n), time.perf_counter()
     rounds = -(-n // size)
     done = crashes = 0
@@ -76,7 +76,7 @@ def run(config: Config) -> dict[str, Any]:
     row = {
         "env": loaded.task.name,
         "variant": variant,
-        "method": pipeline.method_name(loaded.config),
+        "method": tasks.method_name(loaded.config),
         "sha256": loaded.sha256,
         "agent": config.agent,
         "c": config.c,

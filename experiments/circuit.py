@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 import jax
 import numpy as np
 
-from experiments import cli, pipeline, recipes
+from experiments import cli, pipeline, recipes, tasks
 from rp_jax.envs import circuit
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.threat.build import ThreatConfig
 
 
 @dataclass(frozen=True)
-class Config(pipeline.Config):
+class Config(tasks.Config):
     """Settings of Circuit."""
 
     track: str = "default"  # while learning: default, narrowed or circle
@@ -40,7 +40,7 @@ def paper(config: Config) -> Config:
     return dataclasses.replace(config, wall=recipes.PAPER_WALL, planning=recipes.PAPER_PLANNING)
 
 
-def make_task(config: Config) -> pipeline.Task:
+def make_task(config: Config) -> tasks.Task:
     """Environments and threats, checked."""
     if not config.test_tracks:
         raise ValueError("test_tracks is (); it must name at least one track")
@@ -48,7 +48,7 @@ def make_task(config: Config) -> pipeline.Task:
     def params(track: str) -> circuit.Params:
         return circuit.make_params(track, fidelity=config.fidelity, baseline=config.baseline)
 
-    return pipeline.Task(
+    return tasks.Task(
         name="circuit",
         env=circuit,
         train=params(config.track),
@@ -70,7 +70,7 @@ def draw(run: pipeline.Finished) -> None:
     panels = []
     for variant, params in run.task.tests.items():
         demo = circuit.demo_start(params)
-        keys = jax.random.split(pipeline.key_of(run.config.seed, pipeline.STARTS), 7)
+        keys = jax.random.split(tasks.key_of(run.config.seed, tasks.STARTS), 7)
         starts = jax.vmap(circuit.reset, (0, None))(keys, params)
         starts = jax.tree.map(lambda a, b: jax.numpy.concatenate([a[None], b]), demo, starts)
         episodes = drawing.play(run, params, starts, int(params.time_limit), None)

@@ -11,7 +11,7 @@ from typing import Any
 
 import tyro
 
-from experiments import console, pipeline, settings
+from experiments import console, pipeline, settings, tasks
 from experiments.recipes import RECIPES
 from rp_jax import storage
 from rp_jax.checkpoints import Checkpoints
@@ -22,9 +22,9 @@ def main(
     name: str,
     about: str,
     presets: Mapping[str, Callable[[str], Any]],
-    make_task: Callable[[Any], pipeline.Task],
+    make_task: Callable[[Any], tasks.Task],
     argv: Sequence[str] | None = None,
-    run: Callable[[pipeline.Task, Any, Path, Checkpoints], None] | None = None,
+    run: Callable[[tasks.Task, Any, Path, Checkpoints], None] | None = None,
 ) -> Path:
     """Runs an experiment from the command line; exits with 2 on bad input.
 

@@ -17,7 +17,18 @@ from typing import Any
 
 import tyro
 
-from experiments import cli, console, mpc, pipeline, policy_gradient, tables, training
+from experiments import (
+    cli,
+    console,
+    evaluation,
+    mpc,
+    pipeline,
+    policy_gradient,
+    reconnaissance,
+    tables,
+    tasks,
+    training,
+)
 from experiments.runs import EXPERIMENTS
 from experiments.settings import begin
 from rp_jax import storage
@@ -83,7 +94,7 @@ def settings_of(config: Config) -> Any:
 
 
 def by_q_learning(
-    task: pipeline.Task,
+    task: tasks.Task,
     config: Any,
     models: dict | None,
     members: Sequence[training.Member],
@@ -91,22 +102,22 @@ def by_q_learning(
     checkpoints: Checkpoints,
 ) -> list[dict[str, Any]]:
     """Rows of RP or of penalised DQN; all members learn in one program."""
-    pmdp = pipeline.make_pmdp(task, config, models, task.train)
+    pmdp = tasks.make_pmdp(task, config, models, task.train)
     trained, rows = pipeline.plan_and_evaluate(task, config, pmdp, members, folder, checkpoints)
     return with_learning(rows, trained)
 
 
 def by_policy_gradient(
     method: policy_gradient.Method,
-    task: pipeline.Task,
+    task: tasks.Task,
     config: Any,
     folder: Path,
     checkpoints: Checkpoints,
 ) -> list[dict[str, Any]]:
     """Rows of CPO or PID-Lagrangian PPO."""
-    pmdp = pipeline.make_pmdp(task, config, None, task.train)
+    pmdp = tasks.make_pmdp(task, config, None, task.train)
     agents = policy_gradient.learn(method, pmdp, config, folder, checkpoints.at("planning"))
-    rows = pipeline.evaluate_all(task, config, pmdp, agents, checkpoints.at("evaluation"))
+    rows = evaluation.evaluate_all(task, config, pmdp, agents, checkpoints.at("evaluation"))
     return with_learning(rows, agents.trained)
 
 
@@ -136,7 +147,7 @@ def by_search(config: Config, horizon: int) -> list[dict[str, Any]]:
 
 
 def run(
-    config: Config, settings: Any, task: pipeline.Task, folder: Path, checkpoints: Checkpoints
+    config: Config, settings: Any, task: tasks.Task, folder: Path, checkpoints: Checkpoints
 ) -> list[dict[str, Any]]:
     """Writes compare.json after each method, so that nothing is lost."""
     penalties, limit, horizon = SETTINGS[config.env]
@@ -147,15 +158,15 @@ def run(
         storage.write_json(folder / "compare.json", rows)
 
     if "RP" in config.methods:
-        models, _, _ = pipeline.learn_threats(task, settings, folder, checkpoints)
-        members = pipeline.members_of(settings)
+        models, _, _ = reconnaissance.learn_threats(task, settings, folder, checkpoints)
+        members = tasks.members_of(settings)
         at = checkpoints.at("rp")
         add(by_q_learning(task, settings, models, members, folder / "rp", at))
     if "DQN" in config.methods:
         plain = dataclasses.replace(
             settings, x=float("inf"), learning_penalty_from=FIRST_PENALTY.get(config.env)
         )
-        each = pipeline.members_of(plain)
+        each = tasks.members_of(plain)
         members = [m._replace(learning_penalty=p) for p in penalties for m in each]
         at = checkpoints.at("dqn")
         add(by_q_learning(task, plain, None, members, folder / "dqn", at))

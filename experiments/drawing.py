@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.pipeline import MEDIA, Finished, key_of
+from experiments.pipeline import Finished
+from experiments.tasks import MEDIA, key_of
 from rp_jax import evaluate
 from rp_jax.kinematics import Vehicle, make_vehicle
 from rp_jax.planning import loop

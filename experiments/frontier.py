@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments import cli, console, jam, pipeline, tables, training
+from experiments import cli, console, jam, pipeline, reconnaissance, tables, tasks, training
 from rp_jax import storage
 from rp_jax.checkpoints import Checkpoints
 from rp_jax.planning import conditioned
@@ -39,13 +39,13 @@ class Config(jam.Config):
 
 def members_of(config: Config) -> list[training.Member]:
     """One for each threshold and seed."""
-    seeds = pipeline.members_of(config)
+    seeds = tasks.members_of(config)
     return [member._replace(x=x) for x in config.thresholds for member in seeds]
 
 
 def told(
-    task: pipeline.Task, config: Config, pmdp: Any
-) -> tuple[pipeline.Task, Any, list[training.Member]]:
+    task: tasks.Task, config: Config, pmdp: Any
+) -> tuple[tasks.Task, Any, list[training.Member]]:
     """The task, P-MDP and members of the planner that is told x.
 
     Its tests are those of the task at each threshold.
@@ -57,14 +57,14 @@ def told(
         for name, params in task.tests.items()
     }
     whole = conditioned.condition(pmdp, low, high)
-    members = [member._replace(x=1.0) for member in pipeline.members_of(config)]
+    members = [member._replace(x=1.0) for member in tasks.members_of(config)]
     return task._replace(env=whole.env, train=whole.params, tests=tests), whole, members
 
 
-def run(task: pipeline.Task, config: Config, folder: Path, checkpoints: Checkpoints) -> None:
+def run(task: tasks.Task, config: Config, folder: Path, checkpoints: Checkpoints) -> None:
     """Trains and evaluates both, into a prepared folder: frontier.json and the figure."""
-    models, _, _ = pipeline.learn_threats(task, config, folder, checkpoints)
-    pmdp, members = pipeline.make_pmdp(task, config, models, task.train), members_of(config)
+    models, _, _ = reconnaissance.learn_threats(task, config, folder, checkpoints)
+    pmdp, members = tasks.make_pmdp(task, config, models, task.train), members_of(config)
     _, rows = pipeline.plan_and_evaluate(
         task, config, pmdp, members, folder / "separate", checkpoints.at("separate")
     )

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import jax
 import numpy as np
 
-from experiments import cli, pipeline, recipes
+from experiments import cli, pipeline, recipes, tasks
 from rp_jax.envs import jam
 from rp_jax.kinematics import Vehicle
 from rp_jax.planning.loop import LoopConfig
@@ -17,7 +17,7 @@ from rp_jax.threat.build import ThreatConfig
 
 
 @dataclass(frozen=True)
-class Config(pipeline.Config):
+class Config(tasks.Config):
     """Settings of Jam."""
 
     obstacles: int = 8  # while learning
@@ -49,7 +49,7 @@ def paper(config: Config) -> Config:
     )
 
 
-def make_task(config: Config) -> pipeline.Task:
+def make_task(config: Config) -> tasks.Task:
     """Environments and threats, checked."""
     if not config.test_obstacles:
         raise ValueError("test_obstacles is (); it must name at least one count")
@@ -63,7 +63,7 @@ def make_task(config: Config) -> pipeline.Task:
             baseline=config.baseline,
         )
 
-    return pipeline.Task(
+    return tasks.Task(
         name="jam",
         env=jam,
         train=params(config.obstacles, config.fewest_obstacles),
@@ -86,7 +86,7 @@ def draw(run: pipeline.Finished) -> None:
     bar("still", 1, 3, "trajectories")
     panels = []
     for variant, test in run.task.tests.items():
-        keys = jax.random.split(pipeline.key_of(run.config.seed, pipeline.STARTS), 20)
+        keys = jax.random.split(tasks.key_of(run.config.seed, tasks.STARTS), 20)
         starts = jax.vmap(jam.reset, (0, None))(keys, test)
         limit = int(test.time_limit)
         episodes = drawing.play(run, test, starts, limit, present_obstacles)
@@ -129,7 +129,7 @@ def draw_maps(run: pipeline.Finished) -> None:
     panels = drawing.threat_of_one(run, "obstacle", titles, features)
     maps.heat_maps(panels, run.config.x, run.folder / "threat_of_one_obstacle.png")
     drawing.wall_maps(run, (0.1, 0.0, -0.1))
-    key = pipeline.key_of(run.config.seed, pipeline.STARTS)
+    key = tasks.key_of(run.config.seed, tasks.STARTS)
     state = jam.reset(key, run.pmdp.params)
     velocities = {
         "heading 45 deg, speed 0.1": (np.pi / 4, 0.1),

@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 import rp_jax
-from experiments import cli, console, pipeline, tables
+from experiments import cli, console, evaluation, pipeline, tables, tasks
 from experiments.runs import EXPERIMENTS
 from rp_jax import evaluate, storage
 from rp_jax.baselines import mpc
@@ -39,7 +39,7 @@ class Config:
     out: Path | None = None  # folder for results; default: results/mpc-ENV-HORIZON-TIME
 
 
-def prepare(config: Config) -> tuple[pipeline.Task, list[mpc.Search], float]:
+def prepare(config: Config) -> tuple[tasks.Task, list[mpc.Search], float]:
     """The task with the variants that are tested, a search for each, and the penalty.
 
     Raises:
@@ -89,16 +89,16 @@ def action_seconds(key: jax.Array, search: mpc.Search) -> tuple[float, float]:
     """(wall, CPU) time of 100 decisions."""
     act = jax.jit(lambda state, search: jnp.argmax(mpc.pruned(state, search)))
     env: Any = search.model
-    return pipeline.action_seconds(key, env, search.params, lambda state: act(state, search))
+    return evaluation.action_seconds(key, env, search.params, lambda state: act(state, search))
 
 
 def run(
-    config: Config, task: pipeline.Task, searches: list[mpc.Search], penalty: float
+    config: Config, task: tasks.Task, searches: list[mpc.Search], penalty: float
 ) -> list[dict[str, Any]]:
     """One row per variant."""
     rows = []
     name = f"MPC ({config.horizon} steps)"
-    key = pipeline.key_of(config.seed, pipeline.EVALUATION)
+    key = tasks.key_of(config.seed, tasks.EVALUATION)
     for variant, search in zip(task.tests, searches, strict=True):
         with console.progress(f"{name}, {variant}") as bar:
             episodes, seconds = play(key, search, config.episodes, bar)

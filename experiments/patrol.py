@@ -5,11 +5,11 @@ Patrolling between two corners: no shield; no shield, but danger penalised; the 
 python -m experiments.patrol --threat results/RUN/threat
 """
 
-from experiments import ablation, cli, jam, pipeline
+from experiments import ablation, cli, jam, tasks
 from rp_jax.envs import patrol
 
 
-def make_task(config: jam.Config) -> pipeline.Task:
+def make_task(config: jam.Config) -> tasks.Task:
     """That of Jam, with the other reward; threat functions do not know the difference."""
     return jam.make_task(config)._replace(env=patrol, draw=None)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import jax
 import numpy as np
 
-from experiments import cli, pipeline, recipes
+from experiments import cli, pipeline, recipes, tasks
 from rp_jax.envs import point_gather
 from rp_jax.kinematics import Vehicle
 from rp_jax.planning.loop import LoopConfig
@@ -20,7 +20,7 @@ ROOMS = 6  # in the figure of trajectories
 
 
 @dataclass(frozen=True)
-class Config(pipeline.Config):
+class Config(tasks.Config):
     """Settings of Point Gather."""
 
     apples: int = 2  # in a room
@@ -46,7 +46,7 @@ def paper(config: Config) -> Config:
     return dataclasses.replace(config, bomb=recipes.PAPER_BOMB, planning=recipes.PAPER_PLANNING)
 
 
-def make_task(config: Config) -> pipeline.Task:
+def make_task(config: Config) -> tasks.Task:
     """Environments and threats, checked."""
     one_of("baseline", config.baseline, ["paper"])
     if not config.test_bombs:
@@ -57,7 +57,7 @@ def make_task(config: Config) -> pipeline.Task:
             config.apples, bombs, horizon=config.horizon, fidelity=config.fidelity
         )
 
-    return pipeline.Task(
+    return tasks.Task(
         name="point_gather",
         env=point_gather,
         train=params(config.bombs),
@@ -76,7 +76,7 @@ def draw(run: pipeline.Finished) -> None:
     bar("still", 0, 3, "curves")
     drawing.curves_of(run)
     bar("still", 1, 3, "trajectories")
-    keys = jax.random.split(pipeline.key_of(run.config.seed, pipeline.STARTS), ROOMS)
+    keys = jax.random.split(tasks.key_of(run.config.seed, tasks.STARTS), ROOMS)
     starts = jax.vmap(point_gather.reset, (0, None))(keys, params)
     episodes = drawing.play(run, params, starts, int(params.time_limit), objects_left)
     rooms = [scene_of(jax.tree.map(lambda a, i=i: a[i], starts)) for i in range(ROOMS)]
@@ -137,7 +137,7 @@ def draw_maps(run: pipeline.Finished) -> None:
         axis.plot(*(centres[i] + point_gather.ROOM * corners).T, "w")
 
     maps.heat_maps(panels, run.config.x, run.folder / "threat_of_one_bomb.png", outline)
-    key = pipeline.key_of(run.config.seed, pipeline.STARTS)
+    key = tasks.key_of(run.config.seed, tasks.STARTS)
     state = point_gather.reset(key, run.pmdp.params)
     box = (-point_gather.ROOM, point_gather.ROOM) * 2
     velocities = {"heading 0 deg": (0.0, 0.0), "heading 90 deg": (np.pi / 2, 0.0)}

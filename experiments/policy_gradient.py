@@ -11,7 +11,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import console, pipeline, training
+from experiments import console, evaluation, tasks, training
 from rp_jax import evaluate
 from rp_jax.baselines import actor_critic, cpo, pid_lagrangian
 from rp_jax.checkpoints import Checkpoints
@@ -31,7 +31,7 @@ class Method(NamedTuple):
 
 def learn(
     method: Method, pmdp: PMDP, config: Any, folder: Path, checkpoints: Checkpoints
-) -> pipeline.Agents:
+) -> evaluation.Agents:
     """Trains all seeds as one program; writes metrics.jsonl as it goes. They act by their modes.
 
     Args:
@@ -45,7 +45,7 @@ def learn(
         FloatingPointError: something that was learned is not a finite number.
     """
     name, learning, limit = method
-    learner, members = LEARNERS[name], pipeline.members_of(config)
+    learner, members = LEARNERS[name], tasks.members_of(config)
     names = [name] * len(members)
     chunks, length = training.chunks_of(-(-config.planning.steps // learning.rollout.steps))
     folder.mkdir(exist_ok=True)
@@ -66,7 +66,7 @@ def learn(
         bar("", 0, chunks, "compiling")
         began = time.perf_counter()
         init = jax.jit(jax.vmap(functools.partial(learner.init, config=learning), (0, None)))
-        state, c = init(pipeline.keys_of(members, pipeline.PLANNING), pmdp), jnp.float32(limit)
+        state, c = init(tasks.keys_of(members, tasks.PLANNING), pmdp), jnp.float32(limit)
         jitted = jax.jit(
             jax.vmap(chunk, (0, None, None)),
             donate_argnums=0,
@@ -99,7 +99,7 @@ def learn(
             checkpoints,
         )
     trained = training.Trained(params, rows, seconds, compiled - began)
-    return pipeline.Agents(members, names, modes(learning, pmdp), trained)
+    return evaluation.Agents(members, names, modes(learning, pmdp), trained)
 
 
 def carried(state: Any) -> actor_critic.State:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from experiments import cli, console, pipeline, runs
+from experiments import cli, console, runs, tasks
 from rp_jax import evaluate, rare, statistics, storage
 from rp_jax.envs.base import select
 from rp_jax.planning.pmdp import PMDP
@@ -199,7 +199,7 @@ def run(config: Config, loaded: runs.Run, folder: Path) -> dict[str, Any]:
     known = None if config.starts is None else known_starts(config.starts, pmdp, about)
     values = evaluate.greedy(network, weights)
     subject = Subject(pmdp, values, rare.compiled(values))
-    key, search, check = jax.random.split(pipeline.key_of(config.seed, pipeline.RARE), 3)
+    key, search, check = jax.random.split(tasks.key_of(config.seed, tasks.RARE), 3)
     if known is None:
         found, first = estimates(key, subject, config)
         row |= found

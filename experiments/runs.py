@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from flax import linen as nn
 
-from experiments import circuit, jam, pipeline, point_gather, settings
+from experiments import circuit, jam, point_gather, settings, tasks
 from rp_jax import storage
 from rp_jax.planning import loop
 from rp_jax.planning.pmdp import PMDP
@@ -31,7 +31,7 @@ class Subject(NamedTuple):
 class Run(NamedTuple):
     """What a finished run leaves to be used again."""
 
-    task: pipeline.Task
+    task: tasks.Task
     config: Any  # the task's own Config
     models: dict | None  # threat models by kind of hazard; None: no shield
     params: Any  # of the Q-networks, leading axis (seeds,)
@@ -44,7 +44,7 @@ class Run(NamedTuple):
             ValueError: there is no such test.
         """
         params = self.task.tests[one_of("variant", variant, self.task.tests)]
-        return pipeline.make_pmdp(self.task, self.config, self.models, params)
+        return tasks.make_pmdp(self.task, self.config, self.models, params)
 
     def subject(self, variant: str, agent: int) -> "Subject":
         """One agent in one of the tests; "" is the first of them.
@@ -70,7 +70,7 @@ def load(folder: Path) -> Run:
     module = EXPERIMENTS[one_of(f"{path}: task", str(plain.get("task")), EXPERIMENTS)]
     config = settings.restored(module.Config, plain, str(path))
     config.validate()
-    task: pipeline.Task = module.make_task(config)
+    task: tasks.Task = module.make_task(config)
     subs = task.env.sub_rmdps(task.train)
     threats = folder / "threat"
     if config.threat is not None and not threats.is_dir():  # as earlier versions left it
@@ -82,7 +82,7 @@ def load(folder: Path) -> Run:
     elif subs:
         models = artefact.load(threats, task.name, subs)
         used.append(threats / "manifest.json")
-    pmdp = pipeline.make_pmdp(task, config, models, task.train)
+    pmdp = tasks.make_pmdp(task, config, models, task.train)
     params = agents(folder / "agent", pmdp, config.planning, config.seeds)
     # Where a folder lies does not matter.
     lasting = {name: value for name, value in plain.items() if name not in ("out", "threat")}

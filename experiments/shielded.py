@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from experiments import cli, console, jam, pipeline, recipes, tables
+from experiments import cli, console, jam, pipeline, recipes, reconnaissance, tables, tasks
 from rp_jax import evaluate, storage
 from rp_jax.adapters import brax
 from rp_jax.envs.base import Env, select
@@ -132,11 +132,11 @@ def played(key: jax.Array, pmdp: PMDP, weights: Any, policy: Policy, discrete: b
     return jax.lax.while_loop(lambda c: jnp.any(c[1]), advance, carry)[3]
 
 
-def compare(config: Config, task: pipeline.Task, folder: Path) -> list[dict[str, Any]]:
+def compare(config: Config, task: tasks.Task, folder: Path) -> list[dict[str, Any]]:
     """One row per policy, without the shield and with it."""
     settings = config.for_pipeline()
-    models, _, _ = pipeline.learn_threats(task, settings, folder)
-    guarded = pipeline.make_pmdp(task, settings, models, task.train)
+    models, _, _ = reconnaissance.learn_threats(task, settings, folder)
+    guarded = tasks.make_pmdp(task, settings, models, task.train)
     free = guarded.replace(threats=None, x=jnp.asarray(jnp.inf))
     random = uniform(task.env.num_actions(task.train))
     ppo = learned(task.env, task.train, config)
@@ -149,7 +149,7 @@ def compare(config: Config, task: pipeline.Task, folder: Path) -> list[dict[str,
         ("PPO, nearest row", shielded, ppo, guarded, True),
     ]
     rounds = -(-config.episodes // ROUND)
-    keys = jax.random.split(pipeline.key_of(config.seed, EPISODES), rounds)
+    keys = jax.random.split(tasks.key_of(config.seed, EPISODES), rounds)
     rows: list[dict[str, Any]] = []
     with console.progress("episodes") as bar:
         for name, shown, policy, pmdp, discrete in cases:

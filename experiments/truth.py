@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 from jax import Array
 
-from experiments import cli, pipeline, tables
+from experiments import cli, tables, tasks
 from experiments.runs import EXPERIMENTS
 from rp_jax import storage
 from rp_jax.threat import artefact, report
@@ -60,7 +60,7 @@ def run(config: Config) -> list[dict[str, Any]]:
     """One row per hazard and set of states."""
     module = EXPERIMENTS[one_of("env", config.env, ("circuit", "jam"))]
     settings = module.quick("tuned")
-    task: pipeline.Task = module.make_task(settings)
+    task: tasks.Task = module.make_task(settings)
     models = artefact.load(config.threat, config.env, task.env.sub_rmdps(task.train))
     rows = []
     for kind, model in models.items():

@@ -11,7 +11,7 @@ import probe
 import pytest
 from quick import compile_soon  # noqa: F401
 
-from experiments import pipeline, policy_gradient
+from experiments import policy_gradient, tasks
 from rp_jax import evaluate, shield
 from rp_jax.baselines.actor_critic import ActorCriticConfig
 from rp_jax.baselines.cpo import CPOConfig
@@ -171,7 +171,7 @@ def test_policy_gradients_stop_at_rewards_that_are_none(name, tmp_path):
     env, rollout = paid_with(np.nan), ActorCriticConfig("categorical", 8, 16, minibatches=2)
     learning = {"CPO": CPOConfig(rollout), "PID-Lagrangian": PIDConfig(rollout)}[name]
     method, pmdp = policy_gradient.Method(name, learning, 0.1), probe.make_pmdp(env, PARAMS)
-    config = pipeline.Config(planning=dataclasses.replace(CONFIG, steps=256))
+    config = tasks.Config(planning=dataclasses.replace(CONFIG, steps=256))
     with pytest.raises(FloatingPointError, match=f"^{name}: values' weights"):
         policy_gradient.learn(method, pmdp, config, tmp_path / "it", NO_CHECKPOINTS)
 

@@ -12,7 +12,7 @@ from benchmarks import env_step, train_step
 from benchmarks.measure import Row
 from benchmarks.peers import environments, numpy_jam
 from benchmarks.report import machine, short
-from benchmarks.setups import pmdp_of, tasks
+from benchmarks.setups import pmdp_of, quick_tasks
 from experiments import console
 from rp_jax import storage
 from rp_jax.envs import jam
@@ -34,7 +34,7 @@ ENVIRONMENT, LOOP = "rp_jax Jam, observed", "rp_jax DQN"  # what others are comp
 
 def ours() -> list[Row]:
     """Steps of Jam, and of the training loop without and with the shield."""
-    task, config = tasks()["jam"]
+    task, config = quick_tasks()["jam"]
     shielded = pmdp_of(task, config)
     plain = shielded.replace(threats=None, x=jnp.asarray(jnp.inf))
     env = [

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from benchmarks.measure import Row, measure
 from benchmarks.peers import environments
-from benchmarks.setups import tasks
+from benchmarks.setups import quick_tasks
 from rp_jax.envs import base, jam
 from rp_jax.planning import networks
 from rp_jax.planning.pmdp import encode
@@ -61,7 +61,7 @@ def run() -> list[Row]:
     from rejax import DQN
     from rejax.networks import DiscreteQNetwork, EpsilonGreedyPolicy
 
-    _, config = tasks()["jam"]
+    _, config = quick_tasks()["jam"]
     planning = config.planning
     network = networks.TunedNetwork(num_actions=15, scale=jam.SCALE)
     env = Jam(spaces.Discrete, spaces.Box)

@@ -6,7 +6,7 @@ python -m examples.trolley.run --out results/trolley
 from dataclasses import dataclass, field
 
 from examples.trolley import world
-from experiments import ablation, cli, pipeline
+from experiments import ablation, cli, tasks
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.threat.build import ThreatConfig
 from rp_jax.threat.fit import FitConfig
@@ -23,7 +23,7 @@ CART = ThreatConfig(
 
 
 @dataclass(frozen=True)
-class Config(pipeline.Config):
+class Config(tasks.Config):
     """Settings of the trolley."""
 
     carts: int = 6  # while learning
@@ -36,9 +36,9 @@ def quick(recipe: str) -> Config:
     return Config(episodes=4_000, planning=LoopConfig(steps=200_000, num_envs=128, batch=512))
 
 
-def make_task(config: Config) -> pipeline.Task:
+def make_task(config: Config) -> tasks.Task:
     """What the pipeline needs to know."""
-    return pipeline.Task(
+    return tasks.Task(
         name="trolley",
         env=world,
         train=world.make_params(config.carts),

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import pipeline, runs
+from experiments import runs, tasks
 from experiments.paper.section import Claim, Section, holds
 from rp_jax import evaluate, storage
 from rp_jax.baselines import mpc
@@ -50,7 +50,7 @@ def _played(pmdp: Any, policy: Any, weights: Any) -> list[dict[str, Any]]:
     """Positions, and whether the wall was hit at each: from the start of the demo, and others."""
     from experiments import drawing
 
-    key = pipeline.key_of(0, pipeline.STARTS)
+    key = tasks.key_of(0, tasks.STARTS)
     starts = jax.vmap(circuit.reset, (0, None))(jax.random.split(key, EPISODES - 1), pmdp.params)
     demo = circuit.demo_start(pmdp.params)
     starts = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), demo, starts)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import console, mpc, pipeline, policy_gradient, runs
+from experiments import console, evaluation, mpc, policy_gradient, runs, tasks
 from experiments.paper import published
 from experiments.paper.scores import RP, RUNS, read
 from experiments.paper.section import EXCEEDED, MISSED, Claim, Section, Table, holds
@@ -67,20 +67,20 @@ def timers_of(env: str, own: dict[str, runs.Run]) -> dict[str, Callable[[], tupl
         env: the task.
         own: runs of RP, by kind.
     """
-    key = pipeline.key_of(0, pipeline.EVALUATION)
+    key = tasks.key_of(0, tasks.EVALUATION)
     found: dict[str, Callable[[], tuple[float, float]]] = {}
 
     def add(method: str, pmdp: PMDP, policy: Any, weights: Any) -> None:
-        act = pipeline.acting(pmdp, policy, weights)
-        time = pipeline.action_seconds
+        act = evaluation.acting(pmdp, policy, weights)
+        time = evaluation.action_seconds
         found[method] = functools.partial(time, key, pmdp.env, pmdp.params, act)
 
     for method, loaded in own.items():
         subject = loaded.subject(VARIANTS.get(env, ""), 0)
-        add(method, subject.pmdp, pipeline.greedily(subject.network), subject.weights)
+        add(method, subject.pmdp, evaluation.greedily(subject.network), subject.weights)
     subject, penalty = own[RP].subject(VARIANTS.get(env, ""), 0), own[RP].config.penalty
     free = subject.pmdp.replace(threats=None, x=jnp.asarray(jnp.inf))
-    add("DQN", free, pipeline.greedily(subject.network), subject.weights)
+    add("DQN", free, evaluation.greedily(subject.network), subject.weights)
     actor: Any = actor_critic.make_actor(free, CPOConfig().rollout)
     start = jax.vmap(free.env.reset, (0, None))(jax.random.split(key, 1), free.params)
     weights = actor.init(key, free.perceive(start).encoded)

@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from experiments import console, pipeline, runs
+from experiments import console, runs, tasks
 from experiments.paper.section import Section, Table
 from rp_jax import evaluate
 from rp_jax.envs.base import Hazards
@@ -49,7 +49,7 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
     for env in TASKS:
         loaded = runs.load(sources(env))
         pmdp = loaded.pmdp(next(iter(loaded.task.tests)))
-        key = pipeline.key_of(loaded.config.seed, pipeline.SUMS)
+        key = tasks.key_of(loaded.config.seed, tasks.SUMS)
         states = jax.jit(evaluate.visited_states, static_argnums=2)(key, pmdp, STATES)
         points = jax.jit(jax.vmap(pmdp.env.hazards, (0, None)))(states, pmdp.params)["wall"]
         sub = pmdp.env.sub_rmdps(pmdp.params)["wall"]

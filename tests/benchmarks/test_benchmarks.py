@@ -283,7 +283,7 @@ def tiny_tasks(modules=(jam,)):
 
 
 def test_the_setups_are_the_tuned_recipes():
-    found = setups.tasks()
+    found = setups.quick_tasks()
     assert set(found) == set(MODULES)
     for module in MODULES.values():
         task, config = found[module.__name__.split(".")[-1]]
@@ -293,7 +293,7 @@ def test_the_setups_are_the_tuned_recipes():
 
 @pytest.mark.slow
 def test_training_is_measured(monkeypatch):
-    monkeypatch.setattr(train_step, "tasks", tiny_tasks)
+    monkeypatch.setattr(train_step, "quick_tasks", tiny_tasks)
     monkeypatch.setattr(train_step, "ITERATIONS", 2)
     rows = [sane(row) for row in train_step.run()]
     assert [row.batch for row in rows] == [4, 4]
@@ -304,7 +304,7 @@ def test_training_is_measured(monkeypatch):
 
 @pytest.mark.slow
 def test_seeds_are_measured_side_by_side(monkeypatch):
-    monkeypatch.setattr(seeds, "tasks", tiny_tasks)
+    monkeypatch.setattr(seeds, "quick_tasks", tiny_tasks)
     monkeypatch.setattr(seeds, "ITERATIONS", 2)
     rows = [sane(row) for row in seeds.run((2,))]
     assert [(row.name, row.batch) for row in rows] == [("jam", 2)]
@@ -312,7 +312,7 @@ def test_seeds_are_measured_side_by_side(monkeypatch):
 
 @pytest.mark.slow
 def test_threat_queries_are_measured(monkeypatch):
-    monkeypatch.setattr(threat_query, "tasks", tiny_tasks)
+    monkeypatch.setattr(threat_query, "quick_tasks", tiny_tasks)
     rows = [sane(row) for row in threat_query.run((1, 4))]
     assert [(row.name, row.batch, row.unit) for row in rows] == [
         (name, batch, unit) for name in ("jam",) for batch in (1, 4) for unit in ("states", "pairs")

@@ -25,7 +25,7 @@ def corridor(monkeypatch):
     config = LoopConfig(steps=64, num_envs=8, batch=8, n_step=1, replay=64, replay_start=8)
     pmdp = probe.make_pmdp(probe, probe.make_params())
     settings = Settings(config, ThreatConfig())
-    monkeypatch.setattr(endurance.setups, "tasks", lambda: {"jam": (None, settings)})
+    monkeypatch.setattr(endurance.setups, "quick_tasks", lambda: {"jam": (None, settings)})
     monkeypatch.setattr(endurance.setups, "pmdp_of", lambda *_: pmdp)
     monkeypatch.setattr(endurance, "CHUNK", 2)
     with jax.numpy_rank_promotion("allow"):

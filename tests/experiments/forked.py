@@ -24,7 +24,7 @@ def corridor():
     """The corridor as an experiment of seconds: its presets, and how its task is made."""
     import probe
 
-    from experiments import pipeline
+    from experiments import tasks
     from rp_jax.planning.loop import LoopConfig
     from rp_jax.threat.build import ThreatConfig
     from rp_jax.threat.fit import FitConfig
@@ -34,13 +34,13 @@ def corridor():
     planning = LoopConfig(steps=800, num_envs=16, batch=32, n_step=2, replay=512, replay_start=64)
 
     @dataclass(frozen=True)
-    class Config(pipeline.Config):
+    class Config(tasks.Config):
         pit: ThreatConfig = field(default_factory=lambda: threat)
 
     def make_task(config):
         tests = {f"slip {slip:g}": probe.make_params(slip=slip) for slip in (0.1, 0.3)}
         train = probe.make_params()
-        return pipeline.Task("corridor", probe, train, tests, {"pit": config.pit}, None)
+        return tasks.Task("corridor", probe, train, tests, {"pit": config.pit}, None)
 
     def preset(recipe):
         return Config(x=0.5, episodes=64, planning=planning, figures=False)

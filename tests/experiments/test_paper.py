@@ -12,7 +12,7 @@ from stubs import RP, Stub, evaluated
 from tiny import programs_of_a_moment  # noqa: F401
 
 from experiments import all as everything
-from experiments import compare, pipeline
+from experiments import compare, tasks
 from experiments.paper import commands, fig5, published, scores, section, table1, tables3_4, walls
 from experiments.paper import training_crashes as crashes
 from experiments.runs import EXPERIMENTS
@@ -171,7 +171,7 @@ def parsed(name, preset):
     """The configuration of a run, checked as its experiment does it."""
     module_name, *rest = commands.words(name, preset)
     module = importlib.import_module(f"experiments.{module_name}")
-    if not hasattr(module, "Config") or not issubclass(module.Config, pipeline.Config):
+    if not hasattr(module, "Config") or not issubclass(module.Config, tasks.Config):
         if module_name != "patrol":
             config = tyro.cli(module.Config, args=rest)
             if module_name == "compare":

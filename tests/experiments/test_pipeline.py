@@ -3,14 +3,13 @@ import json
 import re
 import subprocess
 import sys
-import types
 
 import jax
 import numpy as np
 import pytest
 from tiny import MODULES, go, programs_of_a_moment  # noqa: F401
 
-from experiments import circuit, pipeline, point_gather, tables
+from experiments import circuit, point_gather, reconnaissance, tasks
 from rp_jax import storage
 from rp_jax.planning import loop
 from rp_jax.threat import artefact
@@ -116,7 +115,7 @@ def check_agents(folder, name):
     module = MODULES[name]
     config = module.quick("tuned")
     task = module.make_task(config)
-    pmdp = pipeline.make_pmdp(task, config, None, task.train)
+    pmdp = tasks.make_pmdp(task, config, None, task.train)
     network = loop.make_network(config.planning, pmdp)
 
     def example(key):
@@ -149,7 +148,7 @@ def test_the_threat_function_has_its_report(finished):
 def test_a_saved_threat_function_serves_another_track_and_threshold(finished, tmp_path):
     config = circuit.Config(threat=finished / "threat", track="narrowed", x=0.1)
     task = circuit.make_task(config)
-    models, curves, seconds = pipeline.learn_threats(task, config, tmp_path)
+    models, curves, seconds = reconnaissance.learn_threats(task, config, tmp_path)
     assert curves == seconds == {}
     subs = task.env.sub_rmdps(task.train)
     for folder in (finished, tmp_path):  # the new run's folder is whole without the other's
@@ -165,77 +164,9 @@ def test_a_saved_threat_function_serves_another_track_and_threshold(finished, tm
 
 def test_without_a_shield_no_threat_is_learned(tmp_path):
     config = circuit.Config(x=float("inf"))
-    assert pipeline.learn_threats(circuit.make_task(config), config, tmp_path) == (None, {}, {})
+    found = reconnaissance.learn_threats(circuit.make_task(config), config, tmp_path)
+    assert found == (None, {}, {})
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("field", "values"),
-    [
-        ("seeds", (0, -3, 1.5, 10**6)),
-        ("seed", (-1, 2**31)),
-        ("x", (-0.1, float("nan"))),
-        ("penalty", (-1.0, float("inf"))),
-        ("learning_penalty", (-1.0, float("nan"))),
-        ("learning_penalty_from", (-1.0, float("inf"))),
-        ("learning_toll", (-1.0, float("inf"))),
-        ("baseline", ("brave", "")),
-        ("episodes", (0, -10, 2.5)),
-        ("fidelity", ("text", "")),
-        ("planning", (loop.LoopConfig(steps=7), loop.LoopConfig(num_envs=0))),
-    ],
-)
-def test_settings_out_of_range_are_named(field, values):
-    circuit.Config().validate()
-    circuit.Config(x=float("inf"), learning_penalty=0.0, seed=2**31 - 1001).validate()
-    for value in values:
-        with pytest.raises(ValueError, match=rf"^{field}.* is .*; it must be"):
-            circuit.Config(**{field: value}).validate()
-
-
-def test_a_penalty_rises_from_its_first_value_and_is_there_half_way():
-    pmdp = types.SimpleNamespace(penalty=np.asarray([5.0, 50.0]))
-    pmdp.replace = lambda penalty: types.SimpleNamespace(penalty=penalty)
-    assert pipeline.during(pmdp, 0.3, circuit.Config()) is pmdp
-    rising = circuit.Config(learning_penalty_from=5.0)
-    expected = {0.0: 5.0, 0.25: 27.5, 0.5: 50.0, 0.9: 50.0}
-    for share, penalty in expected.items():
-        found = pipeline.during(pmdp, share, rising).penalty
-        np.testing.assert_allclose(found, [5.0, penalty])
-
-
-def test_no_two_uses_of_seeds_share_a_key():
-    streams = (
-        *(pipeline.THREAT, pipeline.SUMS, pipeline.PLANNING),
-        *(pipeline.EVALUATION, pipeline.STARTS, pipeline.MEDIA),
-    )
-    data = [
-        tuple(np.asarray(jax.random.key_data(pipeline.key_of(seed, stream))).tolist())
-        for seed in range(20)
-        for stream in streams
-    ]
-    assert len(set(data)) == 20 * len(streams)
-
-
-def test_methods_are_named_by_what_sets_them_apart():
-    name = lambda **changes: pipeline.method_name(circuit.Config(**changes))  # noqa: E731
-    assert name(x=0.001) == "RP (x=0.001)"
-    assert name(x=0.001, learning_penalty=5.0) == "RP (x=0.001, 5)"
-    assert name(x=float("inf"), learning_penalty=50.0) == "DQN (penalty 50)"
-
-
-def test_seeds_are_summed_up_by_hand():
-    row = {"variant": "a", "seed": 0, "episodes": 10, "crashes": 1, "return_mean": 1.0}
-    row["return_ci95"] = 0.5
-    rows = [row, {**row, "seed": 1, "return_mean": 3.0, "crashes": 0}, {**row, "variant": "b"}]
-    both, single = tables.over_seeds(rows)
-    assert (both["variant"], both["seeds"]) == ("a", 2)
-    assert both["return_mean"] == 2.0
-    assert both["return_ci95"] == pytest.approx(12.7062, rel=1e-4)  # t(.975, 1) x 1
-    assert (both["crashes"], both["episodes"], both["crash_rate"]) == (1, 20, 0.05)
-    assert both["crash_ci95"][0] < 0.05 < both["crash_upper95"] < both["crash_ci95"][1]
-    assert (single["variant"], single["seeds"]) == ("b", 1)
-    assert single["return_ci95"] == 0.5  # over its episodes
 
 
 @pytest.mark.slow

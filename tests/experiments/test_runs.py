@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 from tiny import programs_of_a_moment  # noqa: F401
 
-from experiments import certify, circuit, jam, pipeline, rare, runs, settings
+from experiments import certify, circuit, jam, rare, runs, settings, tasks
 from rp_jax import evaluate, statistics, storage
 from rp_jax.envs.tracks import circle_plan
 from rp_jax.planning import loop
@@ -57,7 +57,7 @@ def test_a_run_comes_back_with_the_agents_that_its_table_speaks_of(finished):
     def one(key, params):
         return evaluate.run_episodes(key, pmdp, evaluate.greedy(network, params), 16, batch=16)
 
-    keys = jax.numpy.stack([pipeline.key_of(i, pipeline.EVALUATION) for i in range(2)])
+    keys = jax.numpy.stack([tasks.key_of(i, tasks.EVALUATION) for i in range(2)])
     rows = jax.jit(jax.vmap(one))(keys, run.params)
     for i in range(2):
         found = evaluate.summarise(jax.tree.map(lambda a, i=i: a[i], rows), 200.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from quick import unoptimised
 
-from experiments import pipeline, shielded
+from experiments import shielded, tasks
 from rp_jax.envs import jam
 
 TINY = "--{0}.states 200 --{0}.paths 4 --{0}.test-states 200 --{0}.test-paths 8 " + (
@@ -63,7 +63,7 @@ def test_a_perfect_threat_of_walls_keeps_a_policy_off_them(monkeypatch):
     policy = full_speed(jam, params, None)
     settings = shielded.Config(baseline="plans", obstacles=3, x=0.5).for_pipeline()
     task = shielded.jam.make_task(settings)
-    pmdp = pipeline.make_pmdp(task, settings, {}, params).replace(env=WallsOnly)
+    pmdp = tasks.make_pmdp(task, settings, {}, params).replace(env=WallsOnly)
     monkeypatch.setattr(shielded, "ROUND", 50)
     play = jax.jit(lambda key: shielded.played(key, pmdp, policy.weights, policy, True))
     rows = play(jax.random.key(0))
