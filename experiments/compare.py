@@ -170,12 +170,17 @@ def run(
         members = [m._replace(learning_penalty=p) for p in penalties for m in each]
         at = checkpoints.at("dqn")
         add(by_q_learning(task, plain, None, members, folder / "dqn", at))
-    on_policy = {"CPO": ("CPO", config.cpo), "PID": ("PID-Lagrangian", config.pid)}
-    for method, (name, learning) in on_policy.items():
+    # As released, CPO learns from rewards less the penalty; PID-Lagrangian finds its own.
+    on_policy = {
+        "CPO": ("CPO", config.cpo, settings.penalty),
+        "PID": ("PID-Lagrangian", config.pid, 0.0),
+    }
+    for method, (name, learning, penalty) in on_policy.items():
         if method in config.methods:
             out, at = folder / method.lower(), checkpoints.at(method.lower())
             learner = policy_gradient.Method(name, learning, limit)
-            add(by_policy_gradient(learner, task, settings, out, at))
+            own = dataclasses.replace(settings, learning_penalty=penalty)
+            add(by_policy_gradient(learner, task, own, out, at))
     if "MPC" in config.methods:
         add(by_search(config, horizon))
     return rows

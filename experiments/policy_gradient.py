@@ -36,7 +36,7 @@ def learn(
 
     Args:
         method: what learns.
-        pmdp: without threats.
+        pmdp: without threats; its penalty is taken off the rewards.
         config: the task's settings.
         folder: for metrics.jsonl, created if missing.
         checkpoints: of the learning.

@@ -19,7 +19,7 @@ from rp_jax.threat.build import ThreatConfig
 from rp_jax.validate import number, one_of
 
 # Streams of random numbers, apart.
-THREAT, SUMS, PLANNING, EVALUATION, STARTS, MEDIA, CERTIFICATE, RARE = range(8)
+THREAT, SUMS, PLANNING, EVALUATION, STARTS, MEDIA, CERTIFICATE, RARE, CRASHES = range(9)
 
 
 @dataclass(frozen=True)

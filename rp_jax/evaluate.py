@@ -178,7 +178,7 @@ class Recording(NamedTuple):
 
     states: Any  # before each step; after an end, the terminal state again
     action: Array
-    threat: Array  # (time, episode, A)
+    threat: Array  # (time, episode, A); of a terminal state only where it is met
     admissible: Array  # (time, episode, A)
     secure: Array
     alive: Array  # bool, the episode had not ended before this step
@@ -203,17 +203,17 @@ def record(
     count = starts.time.shape[0]
 
     def step(carry, key):
-        states, alive = carry
-        percept = pmdp.perceive(states)
+        states, alive, looked = carry
+        percept = pmdp.perceive(states, looked)
         action = jax.vmap(shield.masked_argmax)(values(percept), percept.admissible)
         keys = jax.random.split(key, count)
         move = jax.vmap(pmdp.env.step, (0, 0, 0, None))
         reached, outcome = move(keys, states, action, pmdp.params)
         kept = jax.vmap(select)(alive, reached, states)
         shown = Recording(states, action, percept.threat, percept.admissible, percept.secure, alive)
-        return (kept, alive & ~outcome.done), shown
+        return (kept, alive & ~outcome.done, alive), shown
 
-    begin = (starts, jnp.ones(count, bool))
+    begin = (starts, jnp.ones(count, bool), jnp.ones(count, bool))
     return jax.lax.scan(step, begin, jax.random.split(key, steps))[1]
 
 

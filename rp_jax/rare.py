@@ -95,6 +95,33 @@ def resample(key: Array, paths: Paths) -> Paths:
     return jax.tree.map(lambda a: a[chosen], paths)
 
 
+def risks(key: Array, states: Any, actions: Array, pmdp: PMDP, values: Values, tries: int) -> Array:
+    """(n, a) share of `tries` episodes that crash which go on by an action, then by the policy.
+
+    Args:
+        key: of the environment's randomness.
+        states: leading axis (n,), of which no episode has ended.
+        actions: (n, a) int, tried in each of the states.
+        pmdp: the environment, the threats and the threshold.
+        values: scores the actions of the policy, as in `evaluate.run_episodes`.
+        tries: episodes for each state and action.
+    """
+    first, onward = jax.random.split(key)
+
+    def step(key: Array, state: Any, action: Array) -> Any:
+        return pmdp.env.step(key, state, action, pmdp.params)
+
+    move = jax.vmap(jax.vmap(jax.vmap(step, (0, None, None)), (0, None, 0)), (0, 0, 0))
+    keys = jax.random.split(first, (*actions.shape, tries))
+    after = move(keys, states, actions)
+    reached, outcome = jax.tree.map(lambda a: a.reshape(-1, *a.shape[3:]), after)
+    crashed = outcome.danger > 0
+    over = crashed | outcome.done
+    paths = from_starts(reached, pmdp)._replace(crashed=over)  # those stay where they are
+    found = advance(onward, paths, pmdp, values, jnp.asarray(jnp.inf, pmdp.x.dtype)).crashed
+    return jnp.mean(jnp.where(over, crashed, found).reshape(*actions.shape, tries), axis=-1)
+
+
 class Splitting(NamedTuple):
     """One run of the estimator."""
 

@@ -24,7 +24,7 @@ class State(struct.PyTreeNode):
 
 class Params(struct.PyTreeNode):
     cmdp: FiniteCMDP
-    limit: jax.Array  # steps until an episode is cut short; beyond the horizon: never
+    time_limit: jax.Array  # steps until an episode is cut short; beyond the horizon: never
 
 
 def reset(key, params):
@@ -42,7 +42,7 @@ def step(key, state, action, params):
     index = jax.random.choice(key, len(model.start), p=model.transition[state.index, action])
     reached = State(index=index, time=state.time + 1)
     ended = reached.time >= model.horizon
-    terminated, truncated = base.ended(ended, reached.time, params.limit)
+    terminated, truncated = base.ended(ended, reached.time, params.time_limit)
     return reached, base.Outcome(
         reward=model.reward[state.index, action],
         danger=model.danger[state.index, action],
@@ -69,7 +69,7 @@ def num_actions(params):
 def pmdp_of(model, limit=10**6):
     import finite
 
-    params = Params(cmdp=model, limit=jnp.asarray(limit, jnp.int32))
+    params = Params(cmdp=model, time_limit=jnp.asarray(limit, jnp.int32))
     return make_pmdp(finite, params, x=np.inf)
 
 

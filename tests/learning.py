@@ -12,10 +12,10 @@ ROLLOUT = ActorCriticConfig(
     num_envs=64,
     length=32,
     gamma=1.0,
-    beta=1.0,
     critic_rate=3e-3,
+    epochs=5,
     minibatches=4,
-    reward_scale=1.0,
+    memory=0.0,
 )
 
 

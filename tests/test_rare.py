@@ -60,6 +60,33 @@ def test_levels_lessen_the_spread_of_rare_events():
     assert spread[(0.45, 0.55)] < spread[()]
 
 
+def test_the_risk_of_an_action_is_that_of_what_comes_after_it():
+    pmdp = make_graded()
+    cells, times = np.asarray([2, 4, 5, 1]), np.asarray([0, 0, 5, 2])
+    states = jax.vmap(probe.start_at)(jnp.asarray(cells, float))
+    states = states.replace(time=jnp.asarray(times, jnp.int32))
+    actions = jnp.tile(jnp.asarray([[probe.RIGHT, probe.STAY, probe.LEFT]]), (4, 1))
+    tries = 4000
+    measure = jax.jit(rare.risks, static_argnums=(4, 5))
+    found = measure(jax.random.key(0), states, actions, pmdp, rightwards, tries)
+
+    def exact(cell, time):
+        """The probability to get to the pit at 6 from there, always walking right."""
+        if cell >= 6:
+            return 1.0
+        return stats.binom.sf(5 - cell, LIMIT - time, 1 - SLIP) if cell > 0 else 0.0
+
+    expected = np.zeros((4, 3))
+    for i, (cell, time) in enumerate(zip(cells, times, strict=True)):
+        stay = exact(cell, time + 1)
+        for j, way in enumerate((1, 0, -1)):
+            expected[i, j] = (1 - SLIP) * exact(cell + way, time + 1) + SLIP * stay
+    expected[:, 1] = [exact(c, t + 1) for c, t in zip(cells, times, strict=True)]
+    noise = np.sqrt(expected * (1 - expected) / tries)
+    assert (np.abs(found - expected) <= 4 * noise + 1e-6).all()
+    assert found[2, 0] > found[2, 1] > found[2, 2]
+
+
 def test_nothing_that_crashes_gives_zero_and_no_starts():
     pmdp = make_graded().replace(params=probe.make_params(slip=1.0, time_limit=LIMIT))
     found = rare.splitting(jax.random.key(0), pmdp, rightwards, (0.35, 0.55), 50, stage=STAGE)

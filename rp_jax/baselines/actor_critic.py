@@ -1,4 +1,8 @@
-"""What on-policy learners share: rollouts, advantages of reward and of danger, the critic."""
+"""What on-policy learners share: rollouts, advantages of reward and of danger, the critic.
+
+Both are of an episode, as limits and tables are: an end by the time limit is an end like any other,
+and the critic is told the time. The policy is not.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,15 +28,15 @@ class ActorCriticConfig:
     """Sizes of the batches, and how they are turned into advantages."""
 
     policy: str = "gaussian"  # or "categorical", over the environment's discrete actions
-    num_envs: int = 256
+    num_envs: int = 64
     length: int = 64  # steps of each environment in a batch
     gamma: float = 0.995  # discount of reward
-    beta: float = 0.995  # discount of danger in its advantages; limits are of undiscounted danger
+    beta: float = 1.0  # discount of danger in its advantages
     trace: float = 0.95  # lambda of generalised advantage estimation
     critic_rate: float = 1e-3
-    epochs: int = 5  # passes over a batch
-    minibatches: int = 8  # of each pass
-    reward_scale: float = 0.1
+    epochs: int = 10  # passes over a batch
+    minibatches: int = 16  # of each pass
+    memory: float = 0.8  # weight of the batches before, where danger is held against a limit
 
     def validate(self, name: str) -> None:
         """Raises ValueError, naming the field after `name`, if a value is out of range."""
@@ -45,7 +49,7 @@ class ActorCriticConfig:
         number(f"{name}.critic_rate", self.critic_rate, above=0)
         number(f"{name}.epochs", self.epochs, least=1, integer=True)
         number(f"{name}.minibatches", self.minibatches, least=1, most=self.steps, integer=True)
-        number(f"{name}.reward_scale", self.reward_scale, above=0)
+        number(f"{name}.memory", self.memory, least=0, most=1)
         if self.steps % self.minibatches:
             raise ValueError(
                 f"{name}.minibatches is {self.minibatches}; it must divide the {self.steps} steps "
@@ -58,12 +62,35 @@ class ActorCriticConfig:
         return self.num_envs * self.length
 
 
+class Recent(NamedTuple):
+    """Sums over the batches so far, in which the older ones fade."""
+
+    danger: Array  # () of the episodes that ended
+    episodes: Array  # () that ended
+    steps: Array  # ()
+
+
+class Spread(NamedTuple):
+    """How large returns are, from the discounted reward of each episode so far at each step."""
+
+    squares: Array  # () sum of its square
+    steps: Array  # ()
+
+    @property
+    def scale(self) -> Array:
+        """() its root mean square; 1 before anything was earned."""
+        return jnp.where(self.squares > 0, jnp.sqrt(self.squares / self.steps), 1.0)
+
+
 class State(NamedTuple):
     """Carried through learning."""
 
     states: Any  # (B,) environment states
     score: Array  # (B,) reward of the running episodes
     danger: Array  # (B,) likewise
+    earned: Array  # (B,) likewise reward, less the penalty, discounted as of now
+    spread: Spread
+    recent: Recent
     actor: Any
     critic: Any
     critic_opt: optax.OptState
@@ -74,6 +101,7 @@ class Batch(NamedTuple):
     """N = length x num_envs steps."""
 
     encoded: Encoded  # (N,)
+    elapsed: Array  # (N,) share of the time of an episode
     action: Array  # (N,) or (N, 2)
     advantage: Array  # (N, 2) of reward and of danger
     target: Array  # (N, 2) what the critic should have said
@@ -94,11 +122,11 @@ class _Step(NamedTuple):
     """One step of every environment (B,), before advantages are known."""
 
     encoded: Encoded
+    elapsed: Array
     action: Array
-    signal: Array  # (B, 2) reward, scaled, and danger
+    signal: Array  # (B, 2) reward, less the penalty, and danger
     value: Array  # (B, 2) of the state
     next_value: Array  # (B, 2) of the state it led to, a terminal one included
-    terminated: Array
     done: Array
 
 
@@ -111,6 +139,11 @@ def make_actor(pmdp: PMDP, config: ActorCriticConfig) -> nn.Module:
 def make_critic(pmdp: PMDP) -> nn.Module:
     """The networks of both values."""
     return Critic(scale=pmdp.env.SCALE)
+
+
+def elapsed_of(states: Any, pmdp: PMDP) -> Array:
+    """(B,) how much of an episode's time is over, 0 to 1."""
+    return states.time / pmdp.params.time_limit
 
 
 def driver(
@@ -132,12 +165,16 @@ def init(key: Array, pmdp: PMDP, config: ActorCriticConfig) -> State:
     resets = jax.random.split(reset_key, config.num_envs)
     states = jax.vmap(pmdp.env.reset, (0, None))(resets, pmdp.params)
     encoded = pmdp.perceive(states).encoded
-    critic = make_critic(pmdp).init(critic_key, encoded)
+    critic = make_critic(pmdp).init(critic_key, encoded, elapsed_of(states, pmdp))
     nothing = jnp.zeros(config.num_envs, pmdp.x.dtype)
+    zero = jnp.zeros_like(pmdp.x)
     return State(
         states=states,
         score=nothing,
         danger=nothing,
+        earned=nothing,
+        spread=Spread(zero, zero),
+        recent=Recent(zero, zero, zero),
         actor=make_actor(pmdp, config).init(actor_key, encoded),
         critic=critic,
         critic_opt=optax.adam(config.critic_rate).init(critic),
@@ -149,27 +186,25 @@ def gae(
     signal: Array,
     value: Array,
     next_value: Array,
-    terminated: Array,
     done: Array,
     discount: Array,
     trace: float,
 ) -> Array:
     """(T,) generalised advantages (GAE, Schulman et al. 2016) of one environment.
 
-    A true end is worth 0; a time limit, and the batch's last step, the value of the state reached.
+    After an end nothing more comes; after the batch's last step, the value of the state reached.
 
     Args:
         signal: (T,) reward or danger of each step.
         value: (T,) of the state before it.
         next_value: (T,) of the state after it, before any fresh start.
-        terminated: (T,) bool, truly ended there.
-        done: (T,) bool, ended for either reason.
+        done: (T,) bool, the episode ended there.
         discount: () of the signal.
         trace: lambda.
     """
-    chex.assert_equal_shape([signal, value, next_value, terminated, done])
+    chex.assert_equal_shape([signal, value, next_value, done])
     chex.assert_rank(signal, 1)
-    errors = signal + discount * jnp.where(terminated, 0.0, next_value) - value
+    errors = signal + discount * jnp.where(done, 0.0, next_value) - value
 
     def back(ahead: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
         error, ended = now
@@ -179,44 +214,43 @@ def gae(
     return jax.lax.scan(back, jnp.zeros_like(errors[0]), (errors, done), reverse=True)[1]
 
 
-def _advantages(steps: _Step, config: ActorCriticConfig) -> Array:
-    """(T, B, 2) of both signals."""
+def _advantages(steps: _Step, scale: Array, config: ActorCriticConfig) -> Array:
+    """(T, B, 2) of both signals, reward in units of `scale`."""
+    signal = steps.signal / jnp.stack([scale, jnp.ones_like(scale)])[None, None]
     discounts = jnp.asarray([config.gamma, config.beta], steps.value.dtype)
-    each_signal = jax.vmap(gae, (1, 1, 1, None, None, 0, None), 1)
-    each_row = jax.vmap(each_signal, (1, 1, 1, 1, 1, None, None), 1)
-    return each_row(
-        steps.signal,
-        steps.value,
-        steps.next_value,
-        steps.terminated,
-        steps.done,
-        discounts,
-        config.trace,
-    )
+    each_signal = jax.vmap(gae, (1, 1, 1, None, 0, None), 1)
+    each_row = jax.vmap(each_signal, (1, 1, 1, 1, None, None), 1)
+    return each_row(signal, steps.value, steps.next_value, steps.done, discounts, config.trace)
 
 
 def collect(
     key: Array, state: State, pmdp: PMDP, config: ActorCriticConfig
 ) -> tuple[State, Batch, Metrics]:
-    """All environments act for `length` steps; nothing is learned."""
+    """All environments act for `length` steps; nothing is learned.
+
+    Rewards are less `pmdp.penalty` per unit of danger; values and advantages of them are in units
+    of what returns have been so far (their root mean square), whatever the task pays.
+    """
     actor, critic = make_actor(pmdp, config), make_critic(pmdp)
 
-    def look(states: Any) -> tuple[Encoded, Array]:
-        encoded = pmdp.perceive(states).encoded
-        return encoded, jnp.asarray(critic.apply(state.critic, encoded))
+    def look(states: Any) -> tuple[Encoded, Array, Array]:
+        encoded, elapsed = pmdp.perceive(states).encoded, elapsed_of(states, pmdp)
+        return encoded, elapsed, jnp.asarray(critic.apply(state.critic, encoded, elapsed))
 
     def one(carry, key):
-        states, (encoded, value), score, danger = carry
+        states, (encoded, elapsed, value), *sums = carry
         act_key, step_key = jax.random.split(key)
         policy: Any = actor.apply(state.actor, encoded)
         action = policy.sample(act_key)
         keys = jax.random.split(step_key, config.num_envs)
-        carried, (_, (_, next_value)), outcome = base.step_and_renew(
+        carried, (_, (_, _, next_value)), outcome = base.step_and_renew(
             pmdp.env, keys, states, action, pmdp.params, look
         )
-        signal = jnp.stack([config.reward_scale * outcome.reward, outcome.danger], axis=-1)
-        step = _Step(encoded, action, signal, value, next_value, outcome.terminated, outcome.done)
-        score, danger = score + outcome.reward, danger + outcome.danger
+        reward = outcome.reward - pmdp.penalty * outcome.danger
+        signal = jnp.stack([reward, outcome.danger], axis=-1)
+        step = _Step(encoded, elapsed, action, signal, value, next_value, outcome.done)
+        score, danger = sums[0] + outcome.reward, sums[1] + outcome.danger
+        earned = config.gamma * sums[2] + reward
         metrics = Metrics(
             steps=jnp.asarray(config.num_envs, score.dtype),
             episodes=jnp.sum(outcome.done, dtype=score.dtype),
@@ -225,17 +259,23 @@ def collect(
             crashes=jnp.sum(outcome.done & (danger > 0), dtype=score.dtype),
             goals=jnp.sum(outcome.goal, dtype=score.dtype),
         )
-        running = [jnp.where(outcome.done, 0.0, total) for total in (score, danger)]
-        return (*carried, *running), (step, metrics)
+        running = [jnp.where(outcome.done, 0.0, total) for total in (score, danger, earned)]
+        return (*carried, *running), (step, metrics, jnp.sum(jnp.square(earned)))
 
-    begin = (state.states, look(state.states), state.score, state.danger)
+    begin = (state.states, look(state.states), state.score, state.danger, state.earned)
     keys = jax.random.split(key, config.length)
-    (states, _, score, danger), (steps, metrics) = jax.lax.scan(one, begin, keys)
-    advantage = _advantages(steps, config)
-    batch = Batch(steps.encoded, steps.action, advantage, advantage + steps.value)
-    batch = jax.tree.map(lambda a: a.reshape(config.steps, *a.shape[2:]), batch)
+    (states, _, *sums), (steps, metrics, squares) = jax.lax.scan(one, begin, keys)
     metrics = jax.tree.map(lambda m: jnp.sum(m, axis=0), metrics)
-    return state._replace(states=states, score=score, danger=danger), batch, metrics
+    before = state.spread
+    spread = Spread(before.squares + jnp.sum(squares), before.steps + config.steps)
+    now = Recent(metrics.danger, metrics.episodes, metrics.steps)
+    recent = jax.tree.map(lambda old, new: config.memory * old + new, state.recent, now)
+    advantage = _advantages(steps, spread.scale, config)
+    target = advantage + steps.value
+    batch = Batch(steps.encoded, steps.elapsed, steps.action, advantage, target)
+    batch = jax.tree.map(lambda a: a.reshape(config.steps, *a.shape[2:]), batch)
+    state = state._replace(states=states, spread=spread, recent=recent)
+    return state._replace(score=sums[0], danger=sums[1], earned=sums[2]), batch, metrics
 
 
 def update_critic(state: State, batch: Batch, pmdp: PMDP, config: ActorCriticConfig) -> State:
@@ -243,7 +283,7 @@ def update_critic(state: State, batch: Batch, pmdp: PMDP, config: ActorCriticCon
     critic = make_critic(pmdp)
 
     def loss(params):
-        values = jnp.asarray(critic.apply(params, batch.encoded))
+        values = jnp.asarray(critic.apply(params, batch.encoded, batch.elapsed))
         return jnp.mean(jnp.sum(jnp.square(values - batch.target), axis=-1))
 
     grads = jax.grad(loss)(state.critic)

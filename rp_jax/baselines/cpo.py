@@ -212,14 +212,17 @@ def step(state: State, pmdp: PMDP, limit: Array, config: CPOConfig) -> tuple[Sta
 
     Args:
         state: carried.
-        pmdp: the environment; without threats, as nothing is forbidden.
+        pmdp: the environment; without threats, as nothing is forbidden. Its penalty is taken off
+            the rewards.
         limit: () the greatest expected danger of an episode, not discounted; sweep it by `vmap`.
         config: hyperparameters.
     """
     key, collect_key, fit_key = jax.random.split(state.key, 3)
     state, batch, metrics = actor_critic.collect(collect_key, state, pmdp, config.rollout)
-    # The limit is of an episode; advantages are of a step, so both go by the step.
-    excess = (metrics.danger - limit * metrics.episodes) / metrics.steps
+    # The limit is of an episode; advantages are of a step, so both go by the step. One batch alone
+    # may hold less than a crash where the limit is kept.
+    recent = state.recent
+    excess = (recent.danger - limit * recent.episodes) / recent.steps
     network = actor_critic.make_actor(pmdp, config.rollout)
     actor, update = improve(state.actor, network, batch, excess, config)
 

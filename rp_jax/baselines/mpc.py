@@ -21,6 +21,7 @@ from rp_jax.validate import number
 UNSAFE = 1e4  # taken off beyond the limit of danger; more than any reward within a horizon
 SAME = 1e-4  # by which two ways to add up one score may differ
 CHUNK = 16  # sequences of first actions tried at a time
+LOTS = 0x107  # of actions that are equally good
 
 
 class Model(Env, Protocol):
@@ -266,8 +267,22 @@ def omniscient(search: Search) -> Omniscient:
     )
 
 
+def drawn(state: Any, scores: Array) -> Array:
+    """(A,) 0, but for the best of the scores: positive numbers in a random order.
+
+    Equal scores are frequent, and the first actions of a table have much in common. The lots are
+    drawn from the state, so that a search has no key.
+    """
+    place = jax.lax.bitcast_convert_type(state.agent.position, jnp.uint32)
+    key = jax.random.key(LOTS)
+    for part in (state.time, *place):
+        key = jax.random.fold_in(key, part)
+    lots = jax.random.uniform(key, scores.shape, scores.dtype, minval=0.5)
+    return jnp.where(scores >= jnp.max(scores) - SAME, lots, 0.0)
+
+
 def policy(search: Search) -> Callable[[Percept], Array]:
-    """Scores (B, A) of actions, for `evaluate.run_episodes` with an `Omniscient`.
+    """Prefers (B, A) the best actions, for `evaluate.run_episodes` with an `Omniscient`.
 
     States are searched one after another: memory is that of one, and none waits for a harder one.
     """
@@ -275,6 +290,7 @@ def policy(search: Search) -> Callable[[Percept], Array]:
 
     def one(row: tuple[Any, Array]) -> Array:
         state, alive = row
-        return jax.lax.cond(alive, lambda: pruned(state, search), lambda: jnp.zeros(count))
+        search_it = lambda: drawn(state, pruned(state, search))  # noqa: E731
+        return jax.lax.cond(alive, search_it, lambda: jnp.zeros(count))
 
     return lambda percept: jax.lax.map(one, tuple(percept.encoded))

@@ -14,6 +14,9 @@ from rp_jax.baselines.actor_critic import DANGER, REWARD, ActorCriticConfig, Bat
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import number
 
+FAR = 10.0  # beyond the limit, in units of it
+SMALL = 1e-6  # the least that a limit counts as
+
 
 @dataclass(frozen=True)
 class PIDConfig:
@@ -22,9 +25,9 @@ class PIDConfig:
     rollout: ActorCriticConfig = field(default_factory=ActorCriticConfig)
     learning_rate: float = 3e-4  # of the policy
     clip: float = 0.2  # of the probability ratio
-    proportional: float = 1.0
-    integral: float = 0.1
-    derivative: float = 1.0
+    proportional: float = 0.1  # gains, of danger in units of its limit
+    integral: float = 0.005
+    derivative: float = 0.1
 
     def validate(self, name: str) -> None:
         """Raises ValueError, naming the field after `name`, if a value is out of range."""
@@ -61,10 +64,15 @@ class Metrics(NamedTuple):
 def control(
     controller: Controller, danger: Array, limit: Array, config: PIDConfig
 ) -> tuple[Controller, Array]:
-    """The penalty lambda from the danger of the last episodes (Stooke et al., Algorithm 2)."""
-    error = danger - limit
+    """The penalty lambda from the danger of the last episodes (Stooke et al., Algorithm 2).
+
+    Danger counts in units of the limit, since it can fall below it by one of them alone; and no
+    more than `FAR` of them, or what a fresh policy does would be held against it for ever.
+    """
+    unit = jnp.maximum(limit, SMALL)
+    error = jnp.clip((danger - limit) / unit, -1.0, FAR)
     integral = jnp.maximum(controller.integral + error, 0.0)
-    rise = jnp.maximum(danger - controller.danger, 0.0)
+    rise = jnp.clip((danger - controller.danger) / unit, 0.0, FAR)
     penalty = config.proportional * error + config.integral * integral + config.derivative * rise
     return Controller(integral, danger), jnp.maximum(penalty, 0.0)
 
@@ -88,11 +96,9 @@ def objective(
 
 
 def penalised(advantage: Array, penalty: Array) -> Array:
-    """(N,) (A_r - lambda A_d) / (1 + lambda) of advantages (N, 2).
-
-    Advantages are not standardised: the controller's gains are in units of scaled reward.
-    """
-    return (advantage[:, REWARD] - penalty * advantage[:, DANGER]) / (1 + penalty)
+    """(N,) A_r - lambda A_d of advantages (N, 2), standardised once they are one."""
+    gain = advantage[:, REWARD] - penalty * advantage[:, DANGER]
+    return (gain - jnp.mean(gain)) / (jnp.std(gain) + SMALL)
 
 
 def init(key: Array, pmdp: PMDP, config: PIDConfig) -> State:
@@ -111,10 +117,13 @@ def step(state: State, pmdp: PMDP, limit: Array, config: PIDConfig) -> tuple[Sta
     rollout = config.rollout
     key, collect_key, fit_key = jax.random.split(state.learner.key, 3)
     learner, batch, metrics = actor_critic.collect(collect_key, state.learner, pmdp, rollout)
-    # A batch in which no episode ended says nothing about them.
-    measured = metrics.danger / jnp.maximum(metrics.episodes, 1.0)
-    danger = jnp.where(metrics.episodes > 0, measured, state.controller.danger)
-    controller, penalty = control(state.controller, danger, limit, config)
+    # Where no episode has ended, nothing is known of them; the first ones are no rise.
+    recent, known = learner.recent, state.learner.recent.episodes > 0
+    danger = jnp.where(recent.episodes > 0, recent.danger / recent.episodes, limit)
+    before = jnp.where(known, state.controller.danger, danger)
+    controller, penalty = control(
+        Controller(state.controller.integral, before), danger, limit, config
+    )
     network = actor_critic.make_actor(pmdp, rollout)
     acted: Any = network.apply(learner.actor, batch.encoded)
     items = (batch, penalised(batch.advantage, penalty), acted.log_prob(batch.action))

@@ -11,7 +11,7 @@ from rp_jax.planning.networks import features
 from rp_jax.planning.pmdp import Encoded
 
 CONTROLS = 2  # acceleration and turn, as `kinematics.AgentModel.control` takes them
-LOG_STD = -0.5  # of a fresh policy's actions, whose range is [-1, 1]
+LOG_STD = -1.0  # of a fresh policy's actions, whose range is [-1, 1]
 
 
 class Gaussian(NamedTuple):
@@ -117,9 +117,9 @@ class Critic(nn.Module):
     hidden: tuple[int, ...] = (64, 32)
 
     @nn.compact
-    def __call__(self, seen: Encoded) -> Array:
-        """(..., 2) values: of reward, of danger."""
-        x = features(seen, self.scale)
+    def __call__(self, seen: Encoded, elapsed: Array) -> Array:
+        """(..., 2) values, of reward and of danger; `elapsed` (...) is 0 to 1."""
+        x = jnp.concatenate([features(seen, self.scale), elapsed[..., None]], axis=-1)
         towers = [_perceptron(x, self.hidden, 1, name) for name in ("reward", "danger")]
         return jnp.concatenate(towers, axis=-1)
 

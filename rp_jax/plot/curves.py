@@ -246,6 +246,40 @@ def frontier(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     plt.close(figure)
 
 
+def before_crashes(crashes: Sequence[Sequence[Mapping[str, Any]]], path: Path) -> None:
+    """What was known and what could be done in the last steps before each crash.
+
+    Args:
+        crashes: for each crash, rows of `before` (steps), `threat`, `risk` and `best_risk`.
+        path: of the PNG.
+    """
+    figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained", sharey=True)
+    shown = (
+        ("threat", GREY, "least threat of any action, as the agent sees it"),
+        ("risk", RED, "risk of its action"),
+        ("best_risk", BLUE, "risk of the best action"),
+    )
+    floor = 1e-3  # below it, a risk is hardly measured
+    steps = sorted({row["before"] for rows in crashes for row in rows})
+    for axis, (name, colour, title) in zip(axes, shown, strict=True):
+        for rows in crashes:
+            heights = np.maximum([row[name] for row in rows], floor)
+            axis.plot([-row["before"] for row in rows], heights, color=colour, alpha=0.25)
+        middle = [
+            np.median([row[name] for rows in crashes for row in rows if row["before"] == step])
+            for step in steps
+        ]
+        axis.plot([-s for s in steps], np.maximum(middle, floor), color="black", label="median")
+        axis.set_title(title, fontsize=10)
+        axis.set_yscale("log")
+        axis.set_xlabel("steps before the crash")
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel(f"probability of a crash (at least {floor:g})")
+    axes[0].legend()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
 def fit_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path) -> None:
     """Training and validation loss of the threat models, by kind of hazard."""
     figure, axes = plt.subplots(

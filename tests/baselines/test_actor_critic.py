@@ -23,7 +23,6 @@ CONFIG = ActorCriticConfig(
     beta=0.8,
     trace=0.7,
     minibatches=4,
-    reward_scale=0.5,
 )
 
 init = jax.jit(actor_critic.init, static_argnums=2)
@@ -46,13 +45,13 @@ def fit(key, state, pmdp, config):
     return jax.lax.scan(one, state, jax.random.split(key, 40))[0]
 
 
-def slow_gae(signal, value, next_value, terminated, done, discount, trace):
+def slow_gae(signal, value, next_value, done, discount, trace):
     """The defining sum of temporal-difference errors, up to the first end."""
     advantages = []
     for t in range(len(signal)):
         total, weight = 0.0, 1.0
         for k in range(t, len(signal)):
-            ahead = 0.0 if terminated[k] else next_value[k]
+            ahead = 0.0 if done[k] else next_value[k]
             total += weight * (signal[k] + discount * ahead - value[k])
             weight *= discount * trace
             if done[k]:
@@ -65,12 +64,11 @@ def slow_gae(signal, value, next_value, terminated, done, discount, trace):
 def test_advantages_are_the_sums_that_define_them(seed):
     rng = np.random.default_rng(seed)
     signal, value, next_value = rng.normal(size=(3, 30))
-    terminated = rng.random(30) < 0.1
-    done = terminated | (rng.random(30) < 0.1)  # time limits among them
+    done = rng.random(30) < 0.2
     discount, trace = rng.uniform(0.5, 1.0, 2)
-    arguments = [jnp.asarray(a) for a in (signal, value, next_value, terminated, done)]
+    arguments = [jnp.asarray(a) for a in (signal, value, next_value, done)]
     found = actor_critic.gae(*arguments, jnp.asarray(discount), trace)
-    expected = slow_gae(signal, value, next_value, terminated, done, discount, trace)
+    expected = slow_gae(signal, value, next_value, done, discount, trace)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
@@ -78,7 +76,7 @@ def test_without_a_critic_s_help_an_advantage_is_the_return():
     signal = jnp.asarray([1.0, 2.0, 4.0])
     nothing, never = jnp.zeros(3), jnp.zeros(3, bool)
     last = never.at[-1].set(True)
-    found = actor_critic.gae(signal, nothing, nothing, last, last, jnp.asarray(0.5), 1.0)
+    found = actor_critic.gae(signal, nothing, nothing, last, jnp.asarray(0.5), 1.0)
     np.testing.assert_allclose(found, [1 + 1 + 1, 2 + 2, 4])
 
 
@@ -92,7 +90,7 @@ def chain(steps=5):
 
 @pytest.mark.parametrize("limit", [3, 100])
 def test_a_batch_holds_what_happened(limit):
-    """At a time limit the value of the state reached counts, at a true end nothing does."""
+    """After an end nothing counts, be it by the time limit or a true one."""
     model = chain()
     pmdp = finite.pmdp_of(model, limit)
     config = dataclasses.replace(CONFIG, trace=0.0)
@@ -107,12 +105,18 @@ def test_a_batch_holds_what_happened(limit):
     last = min(limit, 5) - 1
     np.testing.assert_array_equal(time, np.repeat(np.arange(10) % (last + 1), 8))
     np.testing.assert_array_equal(index, time)  # it is where it must be at that time
-    critic = actor_critic.make_critic(pmdp)
-    values = np.asarray(
-        critic.apply(bold, pmdp.perceive(finite.all_states(model)).encoded)
-    ).reshape(5, 6, 2)
+    critic, everywhere = actor_critic.make_critic(pmdp), finite.all_states(model)
+    elapsed = actor_critic.elapsed_of(everywhere, pmdp)
+    values = np.asarray(critic.apply(bold, pmdp.perceive(everywhere).encoded, elapsed)).reshape(
+        5, 6, 2
+    )
     ahead = np.append(np.diagonal(values).T[1:], np.zeros((1, 2)), axis=0)
-    target = np.stack([0.5 * 2 * time, time / 10], -1) + np.asarray([0.9, 0.8]) * ahead[time]
+    ahead[last] = 0.0
+    earned = np.cumsum(2 * 0.9 ** -np.arange(5.0) * np.arange(5)) * 0.9 ** np.arange(5)
+    scale = np.sqrt(np.mean(earned[time] ** 2))  # of all discounted rewards so far
+    assert after.spread.scale == pytest.approx(scale, rel=1e-4)
+    reward = 2 * time / scale
+    target = np.stack([reward, time / 10], -1) + np.asarray([0.9, 0.8]) * ahead[time]
     np.testing.assert_allclose(batch.target, target, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(
         batch.advantage, batch.target - np.diagonal(values).T[time], rtol=1e-4, atol=1e-4
@@ -151,20 +155,20 @@ VALUES = {
 @pytest.mark.parametrize("name", VALUES)
 def test_the_critic_learns_values(name):
     model, discount, expected = VALUES[name]
-    config = dataclasses.replace(
-        CONFIG, gamma=discount, beta=discount, critic_rate=0.01, reward_scale=1.0
-    )
+    config = dataclasses.replace(CONFIG, gamma=discount, beta=discount, critic_rate=0.01)
     pmdp = finite.pmdp_of(model)
     state = fit(jax.random.key(1), init(jax.random.key(0), pmdp, config), pmdp, config)
     met = [t * model.shape[1] + t for t in range(len(expected))]
-    encoded = pmdp.perceive(finite.all_states(model)).encoded
-    values = actor_critic.make_critic(pmdp).apply(state.critic, encoded)
+    states = finite.all_states(model)
+    encoded, elapsed = pmdp.perceive(states).encoded, actor_critic.elapsed_of(states, pmdp)
+    values = actor_critic.make_critic(pmdp).apply(state.critic, encoded, elapsed)
+    values = values * jnp.stack([state.spread.scale, jnp.ones(())])[None]
     np.testing.assert_allclose(values[np.asarray(met)], expected, atol=0.05)
 
 
 def test_a_pass_meets_every_step_once_in_another_order():
     rows = jnp.arange(80)
-    batch = Batch(rows, rows, rows, rows)
+    batch = Batch(rows, rows, rows, rows, rows)
     config = dataclasses.replace(CONFIG, epochs=3)
 
     def note(carry, part):
@@ -211,7 +215,7 @@ def test_a_driver_draws_or_takes_the_mode():
         ({"epochs": 0}, "epochs"),
         ({"minibatches": 81}, "minibatches"),
         ({"minibatches": 3}, "minibatches"),
-        ({"reward_scale": 0.0}, "reward_scale"),
+        ({"memory": 1.5}, "memory"),
     ],
 )
 def test_bad_settings_are_named(change, field):

@@ -58,7 +58,7 @@ def policy_and_batch(name, rows=200, seed=0):
     advantage = rng.normal(size=(rows, 2))
     advantage[:, DANGER] = advantage[:, REWARD] + 0.5 * advantage[:, DANGER]
     advantage = jnp.asarray(advantage, float)
-    return network, params, Batch(encoded, action, advantage, advantage)
+    return network, params, Batch(encoded, None, action, advantage, advantage)
 
 
 @pytest.mark.parametrize("name", ACTORS)
@@ -261,7 +261,8 @@ def test_a_batch_of_a_real_task_finds_a_step():
         jnp.asarray(rng.normal(size=(rows, 36)), jnp.float32),
     )
     advantage = jnp.asarray(rng.normal(size=(rows, 2)), jnp.float32)
-    batch = Batch(seen, jnp.asarray(rng.integers(0, 15, rows)), advantage, advantage)
+    actions = jnp.asarray(rng.integers(0, 15, rows))
+    batch = Batch(seen, None, actions, advantage, advantage)
     params = jax.jit(network.init)(jax.random.key(0), seen)
     update = jax.jit(
         lambda params, batch: cpo.improve(params, network, batch, jnp.asarray(-1.0), CPOConfig())[

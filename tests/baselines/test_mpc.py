@@ -233,6 +233,23 @@ def test_a_row_does_not_depend_on_its_batch():
     assert (fewer[3] == 0).all()  # nobody asked
 
 
+def test_one_of_the_best_is_drawn_and_no_other():
+    states = driven("circuit", 12, 11)
+    scores = np.zeros((len(states.time), 15), np.float32)
+    scores[:, [2, 7, 11]] = 3.0
+    scores[:, 5] = 3.0 - 1e-5  # as good, but for rounding
+    draw = jax.jit(jax.vmap(mpc.drawn))
+    lots = np.asarray(draw(states, scores))
+    best = np.zeros(15, bool)
+    best[[2, 5, 7, 11]] = True
+    np.testing.assert_array_equal(lots > 0, np.broadcast_to(best, lots.shape))
+    np.testing.assert_array_equal(lots, draw(states, scores))  # the same state, the same lot
+    later = [np.asarray(draw(states.replace(time=states.time + t), scores)) for t in range(10)]
+    winners = np.concatenate([lots.argmax(axis=1) for lots in later])
+    shares = [(winners == action).mean() for action in (2, 5, 7, 11)]
+    np.testing.assert_allclose(shares, 0.25, atol=0.15)
+
+
 def percept(states, alive):
     return mpc.Percept(mpc.Seen(states, alive), None, None, None)
 

@@ -11,7 +11,7 @@ from quick import unoptimised
 from tabular import cases
 
 from rp_jax.baselines import pid_lagrangian
-from rp_jax.baselines.actor_critic import Batch
+from rp_jax.baselines.actor_critic import Batch, Recent
 from rp_jax.baselines.pid_lagrangian import Controller, PIDConfig
 from rp_jax.baselines.policies import Categorical
 from rp_jax.tabular import oracle, threat
@@ -48,25 +48,28 @@ def test_the_three_terms_by_hand():
         )
         found.append((float(controller.integral), float(penalty)))
     expected = [
-        (0.3, 2 * 0.3 + 0.5 * 0.3 + 3 * 0.5),
-        (0.4, 2 * 0.1 + 0.5 * 0.4),  # a fall counts for nothing
-        (0.6, 2 * 0.2 + 0.5 * 0.6 + 3 * 0.1),
-        (0.4, 0.0),  # 2 * -.2 + .5 * .4 is below 0
-        (0.2, 0.0),
+        (1.5, 2 * 1.5 + 0.5 * 1.5 + 3 * 2.5),  # in units of the limit
+        (2.0, 2 * 0.5 + 0.5 * 2.0),  # a fall counts for nothing
+        (3.0, 2 * 1.0 + 0.5 * 3.0 + 3 * 0.5),
+        (2.0, 0.0),  # 2 * -1 + .5 * 2 is not above 0
+        (1.0, 0.0),
     ]
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
     for _ in range(3):
         controller, _ = pid_lagrangian.control(controller, jnp.zeros(()), jnp.asarray(0.2), config)
     assert controller.integral == 0  # it does not wind up on the safe side
+    controller, _ = pid_lagrangian.control(controller, jnp.ones(()), jnp.asarray(1e-3), config)
+    assert controller.integral == pid_lagrangian.FAR  # nor by what a fresh policy does
 
 
 def test_the_penalty_shares_the_objective_with_the_reward():
     advantage = jnp.asarray([[1.0, 0.5], [-2.0, 1.0]])
     found = pid_lagrangian.penalised(advantage, jnp.asarray(3.0))
-    np.testing.assert_allclose(found, [(1 - 1.5) / 4, (-2 - 3) / 4])
-    np.testing.assert_array_equal(
-        pid_lagrangian.penalised(advantage, jnp.zeros(())), advantage[:, 0]
-    )
+    np.testing.assert_allclose(found, [1.0, -1.0], rtol=1e-4)  # 1 - 1.5 and -2 - 3, standardised
+    many = jnp.asarray([[1.0, 0.5], [-2.0, 1.0], [0.5, 0.0]])
+    found = pid_lagrangian.penalised(many, jnp.asarray(3.0))
+    plain = np.asarray([1 - 1.5, -2 - 3, 0.5])
+    np.testing.assert_allclose(found, (plain - plain.mean()) / plain.std(), rtol=1e-4)
 
 
 def test_the_objective_is_clipped_on_the_side_of_gain():
@@ -79,7 +82,7 @@ def test_the_objective_is_clipped_on_the_side_of_gain():
     logits = jnp.log(jnp.asarray([[0.75, 0.25]] * 4))
     actions = jnp.asarray([0, 0, 1, 1])  # ratios 1.5 and .5
     gain = jnp.asarray([1.0, -1.0, 1.0, -1.0])
-    batch = Batch(None, actions, gain, gain)
+    batch = Batch(None, None, actions, gain, gain)
     found = pid_lagrangian.objective(logits, Network, batch, gain, before, 0.2)
     assert found == pytest.approx((1.2 - 1.5 + 0.5 - 0.8) / 4)
     grads = jax.grad(pid_lagrangian.objective)(logits, Network, batch, gain, before, 0.2)
@@ -89,13 +92,18 @@ def test_the_objective_is_clipped_on_the_side_of_gain():
 def test_a_batch_without_an_end_keeps_the_last_measure(compile_soon):
     model = finite.delayed(steps=9)
     pmdp = finite.pmdp_of(model)
-    config = dataclasses.replace(CONFIG, rollout=dataclasses.replace(ROLLOUT, num_envs=4, length=4))
-    state = init(jax.random.key(0), pmdp, config)
-    state = state._replace(controller=Controller(jnp.zeros(()), jnp.asarray(0.7)))
+    rollout = dataclasses.replace(ROLLOUT, num_envs=4, length=4, memory=0.5)
+    config = dataclasses.replace(CONFIG, rollout=rollout)
+    begun = init(jax.random.key(0), pmdp, config)
+    recent = Recent(*map(jnp.asarray, (1.4, 2.0, 16.0)))
+    controller = Controller(jnp.zeros(()), jnp.asarray(0.7))
+    state = begun._replace(learner=begun.learner._replace(recent=recent), controller=controller)
     state, metrics = learn(state, pmdp, jnp.asarray(0.5), config, 1)
     assert metrics.rollout.episodes == 0
     assert state.controller.danger == pytest.approx(0.7)
-    np.testing.assert_allclose(metrics.penalty, 1.0 * 0.2 + 0.1 * 0.2, rtol=1e-5)
+    np.testing.assert_allclose(metrics.penalty, 0.1 * 0.4 + 0.005 * 0.4, rtol=1e-5)
+    state, metrics = learn(begun, pmdp, jnp.asarray(0.5), config, 1)  # nothing is known at all
+    assert metrics.penalty == state.controller.integral == 0
 
 
 def test_on_a_finite_cmdp_it_keeps_the_limit_and_comes_near_the_optimum():
@@ -104,7 +112,7 @@ def test_on_a_finite_cmdp_it_keeps_the_limit_and_comes_near_the_optimum():
     limit = 0.6 * least + 0.4 * oracle.optimum(model, np.inf).danger
     best = oracle.optimum(model, limit)
     pmdp = finite.pmdp_of(model)
-    config = dataclasses.replace(CONFIG, proportional=5.0, derivative=5.0)
+    config = dataclasses.replace(CONFIG, proportional=0.5, integral=0.1, derivative=0.5)
     state = init(jax.random.key(1), pmdp, config)
     state, metrics = learn(state, pmdp, jnp.asarray(limit, jnp.float32), config, 120)
     danger, value = danger_and_return(model, pmdp, state.learner.actor)

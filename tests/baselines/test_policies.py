@@ -85,11 +85,12 @@ def test_a_fresh_policy_is_even_handed(name):
 
 def test_the_values_of_reward_and_of_danger_share_nothing():
     network = Critic(scale=SCALE)
-    weights = network.init(jax.random.key(0), seen())
+    elapsed = jnp.linspace(0.0, 1.0, 6)
+    weights = network.init(jax.random.key(0), seen(), elapsed)
     for place, name in enumerate(("reward", "danger")):
 
         def total(w, i=place):
-            return jnp.sum(network.apply(w, seen())[:, i])
+            return jnp.sum(network.apply(w, seen(), elapsed)[:, i])
 
         moved = {
             layer: any(bool((a != 0).any()) for a in jax.tree.leaves(grads))

@@ -33,7 +33,7 @@ def test_settings_out_of_range_are_named(field, values):
 def test_no_two_uses_of_seeds_share_a_key():
     streams = (
         *(tasks.THREAT, tasks.SUMS, tasks.PLANNING, tasks.EVALUATION),
-        *(tasks.STARTS, tasks.MEDIA, tasks.CERTIFICATE, tasks.RARE),
+        *(tasks.STARTS, tasks.MEDIA, tasks.CERTIFICATE, tasks.RARE, tasks.CRASHES),
     )
     data = [
         tuple(np.asarray(jax.random.key_data(tasks.key_of(seed, stream))).tolist())
