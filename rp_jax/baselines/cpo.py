@@ -26,7 +26,8 @@ UNCONSTRAINED, CONSTRAINED, RECOVERY = range(3)  # how a step was chosen
 class CPOConfig:
     """Hyperparameters of the learner."""
 
-    rollout: ActorCriticConfig = field(default_factory=ActorCriticConfig)
+    # The gradient of rare danger takes more of a batch than PPO does.
+    rollout: ActorCriticConfig = field(default_factory=lambda: ActorCriticConfig(num_envs=256))
     divergence: float = 0.01  # delta, the trust region: greatest mean KL divergence of an update
     damping: float = 0.01  # added to the diagonal of the Fisher matrix
     products: int = 10  # conjugate gradient iterations
