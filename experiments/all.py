@@ -32,6 +32,7 @@ from experiments.paper import (
     fig4,
     fig5,
     fig6,
+    more_steps,
     paper_recipe,
     second_reward,
     table1,
@@ -52,7 +53,8 @@ from rp_jax.validate import one_of
 
 MODULES: tuple[ModuleType, ...] = (
     *(fig2, fig3, fig4, fig5, fig6, table1, table2, tables3_4, timing, theorems),
-    *(training_crashes, paper_recipe, thresholds, crowds, second_reward, ablations, walls),
+    *(training_crashes, more_steps, paper_recipe, thresholds, crowds, second_reward, ablations),
+    walls,
 )
 RESULTS: dict[str, Any] = {module.__name__.rpartition(".")[2]: module for module in MODULES}
 NAME = "experiments.all"

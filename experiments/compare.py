@@ -5,7 +5,7 @@ learns nothing. Counts the crashes while learning as well as those after it.
 
 python -m experiments.compare --env jam
 python -m experiments.compare --env jam --methods DQN --steps 12000000   # ten times as many
-python -m experiments.compare --env jam --methods CPO --steps 12000000 --cpo.rollout.length 256
+python -m experiments.compare --env jam --methods CPO --cpo.rollout.num-envs 64
 """
 
 import dataclasses

@@ -115,11 +115,12 @@ class Stub:
             "pid": ["PID-Lagrangian"],
         }
         found = []
+        steps = 1000 if folder.name.startswith("long") else 100
         for learner, methods in names.items():
             history = [row for m in methods for row in learned(m, self.seeds, 0.5)]
             write_lines(folder / learner / "metrics.jsonl", history)
             found += [
-                evaluated(variant, method, seed, 0.4, score=30.0)
+                {**evaluated(variant, method, seed, 0.4, score=30.0), "training_steps": steps}
                 for variant in VARIANTS[env][:3]
                 for method in methods
                 for seed in range(self.seeds)

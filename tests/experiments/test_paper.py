@@ -205,6 +205,7 @@ def test_commands_are_understood(name, preset):
     if preset == "full" and name.startswith("compare"):
         of = parsed(name.removeprefix("compare_"), preset)
         assert (config.seeds, config.steps) == (10, of.planning.steps)  # as many as RP has
+        assert parsed(f"long_{config.env}", preset).steps == 10 * config.steps
 
 
 def test_one_switch_differs_from_the_first_table():

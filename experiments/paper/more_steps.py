@@ -1,0 +1,46 @@
+"""Beyond the paper: the learners that RP is compared with, with many more steps."""
+
+from pathlib import Path
+from typing import Any
+
+from experiments import tables
+from experiments.paper import scores
+from experiments.paper.fig5 import TASKS
+from experiments.paper.section import Section, Table
+
+TITLE = "More steps for the others"
+
+
+def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
+    """A row per task, method and number of steps, over the seeds; RP with its own steps alone."""
+    rows = []
+    for env, (variant, runs, _) in TASKS.items():
+        found = [row for name in runs for row in scores.read(sources(name) / "table.json")]
+        few = scores.read(sources(f"compare_{env}") / "compare.json")
+        many = scores.read(sources(f"long_{env}") / "compare.json")
+        times = many[0]["training_steps"] / few[0]["training_steps"]
+        for budget, of in (("as RP", found + few), (f"{times:.1f} times as many", many)):
+            here = [row for row in of if row["variant"] == variant]
+            rows += [{"env": env, "budget": budget, **row} for row in scores.summed_up(here)]
+    return rows
+
+
+def tell(results: list[dict[str, Any]]) -> Section:
+    """Nothing of it was published."""
+    lines = [
+        {
+            "task": row["env"],
+            "method": row["method"],
+            "steps": row["budget"],
+            "seeds": row["seeds"],
+            "return": tables.earned(row),
+            "crashes": tables.crashed(row),
+            "crash rate, % [95 %]": tables.percent(row),
+        }
+        for row in results
+    ]
+    return Section(
+        "Whether those without a threat function catch up if they may learn for longer; RP's steps "
+        "do not count those of the simulators that its threat functions come from.",
+        tables=[Table("After learning, on the task that was learned", lines)],
+    )
