@@ -236,10 +236,7 @@ def show(result: dict[str, Any]) -> None:
             "after": f"{crash['length']} steps",
             "none admissible": f"{crash['insecure']} steps",
             "risk before": "-" if crash["entered"] is None else f"{crash['entered']:.3f}",
-            "risks, 1, 2, ... steps before": " ".join(
-                f"{row['risk']:.2f}" for row in crash["steps"][::-1]
-            ),
-            "most missed": f"{crash['missed']:.2f}, {crash['missed_before']} before",
+            "best would have saved": f"{crash['missed']:.2f}, {crash['missed_before']} ahead",
         }
         for crash in result["looked_at"]
     ]

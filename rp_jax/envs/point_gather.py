@@ -42,6 +42,7 @@ SCALE: tuple[float, ...] = (
     *(1 / 6, 1 / 6, 1.0),  # centre of mass
     *(1.0,) * (2 * BINS),  # apples, bombs
 )  # of an observation, for learners
+USUAL_BOMBS = 8  # in the paper
 FIDELITIES = ("released", "paper")
 
 
@@ -72,7 +73,7 @@ class Params(struct.PyTreeNode):
     time_limit: Array  # () int32, steps
     beta: Array  # () discount of danger
     n_apples: int = struct.field(pytree_node=False, default=2)
-    n_bombs: int = struct.field(pytree_node=False, default=8)
+    n_bombs: int = struct.field(pytree_node=False, default=USUAL_BOMBS)
 
 
 def cells() -> np.ndarray:
@@ -84,7 +85,7 @@ def cells() -> np.ndarray:
 
 def make_params(
     n_apples: int = 2,
-    n_bombs: int = 8,
+    n_bombs: int = USUAL_BOMBS,
     *,
     time_limit: int = 15,
     horizon: int = 15,
@@ -106,8 +107,11 @@ def make_params(
         ValueError: a value is out of range.
     """
     one_of("fidelity", fidelity, FIDELITIES)
-    number("n_apples", n_apples, least=0, most=len(cells()) - 1, integer=True)
-    number("n_bombs", n_bombs, least=1, most=len(cells()) - n_apples, integer=True)
+    room = len(cells())
+    number("n_bombs", n_bombs, least=1, most=room, integer=True)
+    # Of two numbers that do not fit together, that one is named which leaves its usual.
+    number("n_apples", n_apples, least=0, most=room - min(n_bombs, USUAL_BOMBS), integer=True)
+    number("n_bombs", n_bombs, least=1, most=room - n_apples, integer=True)
     positive("time_limit", time_limit, most=10**9, integer=True)
     positive("horizon", horizon, most=100, integer=True)
     positive("beta", beta, most=1.0)

@@ -273,6 +273,7 @@ def before_crashes(crashes: Sequence[Sequence[Mapping[str, Any]]], path: Path) -
         axis.set_title(title, fontsize=10)
         axis.set_yscale("log")
         axis.set_xlabel("steps before the crash")
+        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         axis.grid(alpha=0.3)
     axes[0].set_ylabel(f"probability of a crash (at least {floor:g})")
     axes[0].legend()
