@@ -7,7 +7,16 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from experiments import circuit, cli, jam, pipeline, point_gather
+from experiments import (
+    circuit,
+    cli,
+    evaluation,
+    jam,
+    pipeline,
+    planning,
+    point_gather,
+    reconnaissance,
+)
 from rp_jax import storage
 from rp_jax.threat import artefact
 from rp_jax.threat.model import ThreatModel, ThreatNetwork
@@ -29,8 +38,10 @@ def refused(tmp_path, monkeypatch, capsys):
         pytest.fail("work was begun on bad input")
 
     monkeypatch.chdir(tmp_path)
-    for name in ("run", "learn_threats", "plan", "evaluate_all"):
-        monkeypatch.setattr(pipeline, name, forbidden)
+    monkeypatch.setattr(pipeline, "run", forbidden)
+    monkeypatch.setattr(reconnaissance, "learn_threats", forbidden)
+    monkeypatch.setattr(planning, "plan", forbidden)
+    monkeypatch.setattr(evaluation, "evaluate_all", forbidden)
 
     def check(name, *argv, says, keeps=()):
         capsys.readouterr()
