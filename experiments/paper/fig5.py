@@ -59,16 +59,7 @@ def tell(results: dict[str, Any]) -> Section:
     learned = []
     for env, of in results.items():
         for row in scores.summed_up(of["evaluated"] + of["levels"]):
-            learned.append(
-                {
-                    "task": env,
-                    "method": row["method"],
-                    "seeds": row["seeds"],
-                    "return": tables.earned(row),
-                    "crashes": tables.crashed(row),
-                    "crash rate, % [95 %]": tables.percent(row),
-                }
-            )
+            learned.append(line(env, row))
     claims = [claim for env in ("circuit", "jam") for claim in _ahead(results[env], env)]
     return Section(
         f"{len(seeds)} seed(s); lines are means over seeds, bands 90 % intervals. Curves show the "
@@ -81,6 +72,18 @@ def tell(results: dict[str, Any]) -> Section:
             "animation.gif": "Point Gather, x = .5: an episode, and the threat of each action.",
         },
     )
+
+
+def line(env: str, row: dict[str, Any]) -> dict[str, Any]:
+    """Of a table: what a method's agents do on a task after learning."""
+    return {
+        "task": env,
+        "method": row["method"],
+        "seeds": row["seeds"],
+        "return": tables.earned(row),
+        "crashes": tables.crashed(row),
+        "crash rate, % [95 %]": tables.percent(row),
+    }
 
 
 def _by_step(history: list[dict], method: str) -> list[tuple[int, float, float]]:

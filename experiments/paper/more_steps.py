@@ -3,9 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from experiments import tables
 from experiments.paper import scores
-from experiments.paper.fig5 import TASKS
+from experiments.paper.fig5 import TASKS, line
 from experiments.paper.section import Section, Table
 
 TITLE = "More steps for the others"
@@ -27,18 +26,7 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
 
 def tell(results: list[dict[str, Any]]) -> Section:
     """Nothing of it was published."""
-    lines = [
-        {
-            "task": row["env"],
-            "method": row["method"],
-            "steps": row["budget"],
-            "seeds": row["seeds"],
-            "return": tables.earned(row),
-            "crashes": tables.crashed(row),
-            "crash rate, % [95 %]": tables.percent(row),
-        }
-        for row in results
-    ]
+    lines = [{**line(row["env"], row), "steps": row["budget"]} for row in results]
     return Section(
         "Whether those without a threat function catch up if they may learn for longer; RP's steps "
         "do not count those of the simulators that its threat functions come from.",

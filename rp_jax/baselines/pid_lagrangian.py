@@ -15,7 +15,7 @@ from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import number
 
 FAR = 10.0  # beyond the limit, in units of it
-SMALL = 1e-6  # the least that a limit counts as
+SMALL = 1e-6  # keeps quotients finite: the least that a limit counts as
 
 
 @dataclass(frozen=True)
