@@ -22,11 +22,12 @@ SMALL = 1e-6  # keeps quotients finite: the least that a limit counts as
 class PIDConfig:
     """Hyperparameters of the learner."""
 
-    rollout: ActorCriticConfig = field(default_factory=ActorCriticConfig)
+    # What comes long after an action is noise in the danger of it, and a penalty amplifies it.
+    rollout: ActorCriticConfig = field(default_factory=lambda: ActorCriticConfig(beta=0.9))
     learning_rate: float = 3e-4  # of the policy
     clip: float = 0.2  # of the probability ratio
     proportional: float = 0.1  # gains, of danger in units of its limit
-    integral: float = 0.005
+    integral: float = 0.01
     derivative: float = 0.1
 
     def validate(self, name: str) -> None:

@@ -101,7 +101,7 @@ def test_a_batch_without_an_end_keeps_the_last_measure(compile_soon):
     state, metrics = learn(state, pmdp, jnp.asarray(0.5), config, 1)
     assert metrics.rollout.episodes == 0
     assert state.controller.danger == pytest.approx(0.7)
-    np.testing.assert_allclose(metrics.penalty, 0.1 * 0.4 + 0.005 * 0.4, rtol=1e-5)
+    np.testing.assert_allclose(metrics.penalty, 0.1 * 0.4 + 0.01 * 0.4, rtol=1e-5)
     state, metrics = learn(begun, pmdp, jnp.asarray(0.5), config, 1)  # nothing is known at all
     assert metrics.penalty == state.controller.integral == 0
 

@@ -18,7 +18,7 @@ from rp_jax.baselines.pid_lagrangian import PIDConfig
 
 LEARNERS = {
     "CPO": (cpo, CPOConfig()),
-    "PID": (pid_lagrangian, PIDConfig(learning_rate=1e-3)),
+    "PID": (pid_lagrangian, PIDConfig(learning_rate=1e-3, integral=0.02)),
 }
 every_learner = pytest.mark.parametrize("name", LEARNERS)
 
