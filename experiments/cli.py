@@ -91,9 +91,9 @@ def resumed(name: str, folder: Path, kind: type, argv: Sequence[str]) -> tuple[A
             "its config.json"
         )
     plain = settings.interrupted(folder, name)
-    config = settings.restored(kind, plain, str(folder / "config.json"))
-    if config.devices == "cluster":
+    if plain.get("devices") == "cluster":
         raise ValueError(f"resume is {folder}; its devices is 'cluster'; it must be 'one' or 'all'")
+    config = settings.restored(kind, plain, str(folder / "config.json"))
     return config, settings.checkpoints_of(folder)
 
 

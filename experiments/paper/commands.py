@@ -22,12 +22,13 @@ COMMANDS: dict[str, str] = {
     "circuit_paper": "circuit --recipe paper {episodes} {paper_steps} {paper_wall}",
     "jam_paper": "jam --recipe paper {episodes} {paper_steps} {paper_wall} {paper_obstacle}",
     # What RP is compared with.
-    "compare_circuit": "compare --env circuit --methods DQN CPO PID {compare_circuit}",
-    "compare_jam": "compare --env jam --methods DQN CPO PID {compare}",
-    "compare_point_gather": "compare --env point_gather --methods DQN CPO PID {compare}",
-    "long_circuit": "compare --env circuit --methods DQN CPO PID {long_circuit}",
-    "long_jam": "compare --env jam --methods DQN CPO PID {long}",
-    "long_point_gather": "compare --env point_gather --methods DQN CPO PID {long}",
+    **{
+        f"{more}{method.lower()}_{env}": f"compare --env {env} --methods {method} "
+        + f"{{{more or 'as_'}{env}}}"
+        for more in ("", "long_")
+        for env in ("circuit", "jam", "point_gather")
+        for method in ("DQN", "CPO", "PID")
+    },
     "mpc_circuit_3": "mpc --env circuit --horizon 3 {mpc}",
     "mpc_circuit_4": "mpc --env circuit --horizon 4 {mpc}",
     "mpc_circuit_5": "mpc --env circuit --horizon 5 --variants default {mpc_few}",
@@ -50,6 +51,7 @@ COMMANDS: dict[str, str] = {
 }
 
 _FIT = "--{0}.fit.steps 2000 --{0}.test-states 500 --{0}.test-paths 1024"
+_FEW, _MORE = (f"--steps {steps} --episodes 1000" for steps in (200_000, 600_000))
 SIZES: dict[str, dict[str, str]] = {
     "full": {
         "frozen_lake": "",
@@ -67,10 +69,12 @@ SIZES: dict[str, dict[str, str]] = {
         "paper_wall": "",
         "paper_obstacle": "",
         "few_states": "--obstacle.states 20000 --obstacle.paths 640",
-        "compare": "--seeds 10 --steps 1200000 --episodes 2000",
-        "compare_circuit": "--seeds 10 --steps 1800000 --episodes 2000",
-        "long": "--steps 12000000 --episodes 2000",
+        "as_circuit": "--seeds 10 --steps 1800000 --episodes 2000",
+        "as_jam": "--seeds 10 --steps 1200000 --episodes 2000",
+        "as_point_gather": "--seeds 10 --steps 1200000 --episodes 2000",
         "long_circuit": "--steps 18000000 --episodes 2000",
+        "long_jam": "--steps 12000000 --episodes 2000",
+        "long_point_gather": "--steps 12000000 --episodes 2000",
         "mpc": "--episodes 1000",
         "mpc_few": "--episodes 200",
     },
@@ -90,10 +94,8 @@ SIZES: dict[str, dict[str, str]] = {
         "paper_wall": "--wall.states 20000 " + _FIT.format("wall"),
         "paper_obstacle": "--obstacle.states 5000 " + _FIT.format("obstacle"),
         "few_states": "--obstacle.states 2000 --obstacle.paths 640",
-        "compare": "--steps 200000 --episodes 1000",
-        "compare_circuit": "--steps 200000 --episodes 1000",
-        "long": "--steps 600000 --episodes 1000",
-        "long_circuit": "--steps 600000 --episodes 1000",
+        **dict.fromkeys(("as_circuit", "as_jam", "as_point_gather"), _FEW),
+        **dict.fromkeys(("long_circuit", "long_jam", "long_point_gather"), _MORE),
         "mpc": "--episodes 50",
         "mpc_few": "--episodes 5",
     },

@@ -17,7 +17,6 @@ TASKS: dict[str, tuple[str, tuple[str, ...], tuple[int, ...]]] = {
 }
 ALMOST = 80  # per cent
 COMPETITIVE = 0.9  # of the best return that keeps c
-LEARNERS = ("dqn", "cpo", "pid")  # folders inside a comparison
 KEPT = ("method", "seed", "steps", "episodes", "return_mean", "crashes")
 
 
@@ -25,12 +24,11 @@ def run(sources: Any, folder: Path) -> dict[str, Any]:
     """By task, rows per chunk, method and seed; rows of MPC; what RP and others end with."""
     found: dict[str, Any] = {}
     for env, (variant, runs, searches) in TASKS.items():
-        compared = sources(f"compare_{env}")
         files = [sources(name) / "metrics.jsonl" for name in runs]
-        files += [compared / name / "metrics.jsonl" for name in LEARNERS]
         history = [row for file in files for row in scores.read_lines(file)]
+        history += scores.curves(sources, env)
         rows = [row for name in runs for row in scores.read(sources(name) / "table.json")]
-        rows += scores.read(compared / "compare.json")
+        rows += scores.evaluated(sources, env)
         files = [sources(f"mpc_{env}_{steps}") / "table.json" for steps in searches]
         levels = [row for file in files for row in scores.read(file)]
         found[env] = {

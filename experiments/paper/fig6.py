@@ -25,7 +25,7 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
     loaded = runs.load(sources("circuit"))
     (folder / "animation.gif").write_bytes((sources("circuit") / "animation.gif").read_bytes())
     planning = loaded.config.planning
-    agents = sources("compare_circuit") / "dqn" / "agent"
+    agents = sources("dqn_circuit") / "dqn" / "agent"
     members = storage.read_manifest(agents, "Q-network")["about"]["members"]
     first = next(i for i, member in enumerate(members) if member["learning_penalty"] == 0)
     found = []

@@ -15,8 +15,8 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
     rows = []
     for env, (variant, runs, _) in TASKS.items():
         found = [row for name in runs for row in scores.read(sources(name) / "table.json")]
-        few = scores.read(sources(f"compare_{env}") / "compare.json")
-        many = scores.read(sources(f"long_{env}") / "compare.json")
+        few = scores.evaluated(sources, env)
+        many = scores.evaluated(lambda name: sources(f"long_{name}"), env)
         times = many[0]["training_steps"] / few[0]["training_steps"]
         for budget, of in (("as RP", found + few), (f"{times:.1f} times as many", many)):
             here = [row for row in of if row["variant"] == variant]

@@ -48,10 +48,31 @@ def by_kind(sources: Any, env: str) -> list[Row]:
 def collect(sources: Any, env: str, searches: Sequence[int]) -> list[Row]:
     """One row per method, variant and seed: RP, the methods compared with, MPC."""
     rows = by_kind(sources, env)
-    rows += read(sources(f"compare_{env}") / "compare.json")
+    rows += evaluated(sources, env)
     for steps in searches:
         rows += read(sources(f"mpc_{env}_{steps}") / "table.json")
     return rows
+
+
+def learners(sources: Any, env: str) -> dict[str, Path]:
+    """Folders of the runs of each method that RP is compared with, by its name in commands."""
+    return {name: sources(f"{name}_{env}") for name in ("dqn", "cpo", "pid")}
+
+
+def evaluated(sources: Any, env: str) -> list[Row]:
+    """One row per method that learns without threats, variant and seed."""
+    return [
+        row for folder in learners(sources, env).values() for row in read(folder / "compare.json")
+    ]
+
+
+def curves(sources: Any, env: str) -> list[Row]:
+    """One row per method that learns without threats, seed and chunk of its learning."""
+    return [
+        row
+        for name, folder in learners(sources, env).items()
+        for row in read_lines(folder / name / "metrics.jsonl")
+    ]
 
 
 def repenalised(row: Row, more: float) -> Row:

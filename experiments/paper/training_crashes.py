@@ -5,7 +5,6 @@ from typing import Any
 
 from experiments import tables
 from experiments.paper import published, scores
-from experiments.paper.fig5 import LEARNERS
 from experiments.paper.section import Claim, Section, Table, holds
 from rp_jax import statistics
 
@@ -21,10 +20,8 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
         own = own | ALSO.get(env, {})
         files = {method: sources(name) / "metrics.jsonl" for method, name in own.items()}
         histories = {method: scores.read_lines(file) for method, file in files.items()}
-        compared = sources(f"compare_{env}")
-        for name in LEARNERS:
-            for row in scores.read_lines(compared / name / "metrics.jsonl"):
-                histories.setdefault(row["method"], []).append(row)
+        for row in scores.curves(sources, env):
+            histories.setdefault(row["method"], []).append(row)
         for method, history in histories.items():
             episodes, crashes, inadmissible = (
                 sum(row.get(key, 0) for row in history)

@@ -1,5 +1,6 @@
 """PPO with a penalty that a PID controller adapts (Stooke et al. 2020)."""
 
+import functools
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -26,6 +27,7 @@ class PIDConfig:
     rollout: ActorCriticConfig = field(default_factory=lambda: ActorCriticConfig(beta=0.9))
     learning_rate: float = 3e-4  # of the policy
     clip: float = 0.2  # of the probability ratio
+    divergence: float = 0.01  # from the policy that acted, at which a batch moves it no more
     proportional: float = 0.1  # gains, of danger in units of its limit
     integral: float = 0.01
     derivative: float = 0.1
@@ -35,6 +37,7 @@ class PIDConfig:
         self.rollout.validate(f"{name}.rollout")
         number(f"{name}.learning_rate", self.learning_rate, above=0)
         number(f"{name}.clip", self.clip, above=0, most=1)
+        number(f"{name}.divergence", self.divergence, above=0)
         number(f"{name}.proportional", self.proportional, least=0)
         number(f"{name}.integral", self.integral, least=0)
         number(f"{name}.derivative", self.derivative, least=0)
@@ -96,6 +99,16 @@ def objective(
     return jnp.mean(jnp.minimum(ratio * gain, jnp.clip(ratio, 1 - clip, 1 + clip) * gain))
 
 
+def moved(params: Any, network: nn.Module, batch: Batch, before: Array) -> Array:
+    """() KL divergence from the policy that acted, estimated from its actions: E[r - 1 - log r].
+
+    Arguments are those of `objective`.
+    """
+    policy: Any = network.apply(params, batch.encoded)
+    log_ratio = policy.log_prob(batch.action) - before
+    return jnp.mean(jnp.expm1(log_ratio) - log_ratio)
+
+
 def penalised(advantage: Array, penalty: Array) -> Array:
     """(N,) A_r - lambda A_d of advantages (N, 2), standardised once they are one."""
     gain = advantage[:, REWARD] - penalty * advantage[:, DANGER]
@@ -131,13 +144,17 @@ def step(state: State, pmdp: PMDP, limit: Array, config: PIDConfig) -> tuple[Sta
     transform = optax.adam(config.learning_rate)
 
     def update(carry, items):
-        learner, opt = carry
+        learner, opt, near = carry
         part, gain, before = items
+        near &= moved(learner.actor, network, part, before) <= config.divergence
         grads = jax.grad(objective)(learner.actor, network, part, gain, before, config.clip)
-        changes, opt = transform.update(jax.tree.map(jnp.negative, grads), opt)
-        learner = learner._replace(actor=optax.apply_updates(learner.actor, changes))
-        return actor_critic.update_critic(learner, part, pmdp, rollout), opt
+        changes, new_opt = transform.update(jax.tree.map(jnp.negative, grads), opt)
+        found = (optax.apply_updates(learner.actor, changes), new_opt)
+        kept = (learner.actor, opt)
+        actor, opt = jax.tree.map(functools.partial(jnp.where, near), found, kept)
+        learner = learner._replace(actor=actor)
+        return actor_critic.update_critic(learner, part, pmdp, rollout), opt, near
 
-    carry = (learner._replace(key=key), state.actor_opt)
-    learner, opt = actor_critic.pass_over(fit_key, carry, items, update, rollout)
+    carry = (learner._replace(key=key), state.actor_opt, jnp.asarray(True))
+    learner, opt, _ = actor_critic.pass_over(fit_key, carry, items, update, rollout)
     return State(learner, opt, controller), Metrics(metrics, penalty)

@@ -5,6 +5,7 @@ import finite
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from learning import ROLLOUT, danger_and_return
 from quick import unoptimised
@@ -89,6 +90,36 @@ def test_the_objective_is_clipped_on_the_side_of_gain():
     np.testing.assert_array_equal(np.abs(grads).sum(axis=-1) > 0, [False, True, True, False])
 
 
+def test_a_batch_moves_the_policy_only_so_far(compile_soon):
+    """Steps of a tenth would throw it about; as long as it is near, a batch takes the same ones."""
+    pmdp = finite.pmdp_of(finite.bandit([0.0, 1.0, 0.5]))
+
+    def distance(divergence):
+        config = dataclasses.replace(CONFIG, learning_rate=0.1, divergence=divergence)
+        begun = init(jax.random.key(0), pmdp, config)
+        after, _ = learn(begun, pmdp, jnp.asarray(1.0), config, 1)
+        moved = jax.tree.map(jnp.subtract, after.learner.actor, begun.learner.actor)
+        return float(optax.tree.norm(moved))
+
+    # The first minibatch is seen by the policy that acted, so that one is always learned from.
+    assert 0 < distance(1e-9) < distance(0.1) < distance(1e9)
+
+
+def test_how_far_a_policy_has_moved_is_estimated():
+    class Network:
+        @staticmethod
+        def apply(params, encoded):
+            return Categorical(jnp.broadcast_to(params, (*encoded.shape, 2)))
+
+    old, new = jnp.log(jnp.asarray([0.5, 0.5])), jnp.log(jnp.asarray([0.75, 0.25]))
+    actions = jnp.asarray([0, 1])  # as often as the old policy takes them
+    batch = Batch(jnp.zeros(2), None, actions, None, None)
+    before = Categorical(old).log_probs[actions]
+    found = pid_lagrangian.moved(new, Network, batch, before)
+    assert found == pytest.approx(float(Categorical(old).kl(Categorical(new))), abs=1e-6)
+    assert pid_lagrangian.moved(old, Network, batch, before) == pytest.approx(0, abs=1e-7)
+
+
 def test_a_batch_without_an_end_keeps_the_last_measure(compile_soon):
     model = finite.delayed(steps=9)
     pmdp = finite.pmdp_of(model)
@@ -144,6 +175,7 @@ def test_limits_and_seeds_side_by_side_learn_what_each_learns_alone(compile_soon
         ({"learning_rate": 0.0}, "learning_rate"),
         ({"clip": 0.0}, "clip"),
         ({"proportional": -1.0}, "proportional"),
+        ({"divergence": 0.0}, "divergence"),
         ({"integral": float("inf")}, "integral"),
         ({"derivative": float("nan")}, "derivative"),
         ({"rollout": dataclasses.replace(ROLLOUT, length=0)}, r"rollout\.length"),

@@ -109,22 +109,21 @@ class Stub:
         storage.write_json(folder / "threat" / "report.json", rows)
 
     def compare(self, folder, env):
-        names = {
+        learner = folder.name.removeprefix("long_").partition("_")[0]
+        methods = {
             "dqn": [f"DQN (penalty {p})" for p in PENALTIES[env]],
             "cpo": ["CPO"],
             "pid": ["PID-Lagrangian"],
-        }
-        found = []
+        }[learner]
         steps = 1000 if folder.name.startswith("long") else 100
-        for learner, methods in names.items():
-            history = [row for m in methods for row in learned(m, self.seeds, 0.5)]
-            write_lines(folder / learner / "metrics.jsonl", history)
-            found += [
-                {**evaluated(variant, method, seed, 0.4, score=30.0), "training_steps": steps}
-                for variant in VARIANTS[env][:3]
-                for method in methods
-                for seed in range(self.seeds)
-            ]
+        history = [row for m in methods for row in learned(m, self.seeds, 0.5)]
+        write_lines(folder / learner / "metrics.jsonl", history)
+        found = [
+            {**evaluated(variant, method, seed, 0.4, score=30.0), "training_steps": steps}
+            for variant in VARIANTS[env][:3]
+            for method in methods
+            for seed in range(self.seeds)
+        ]
         storage.write_json(folder / "compare.json", found)
 
     def frontier(self, folder, env):

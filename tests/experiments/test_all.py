@@ -241,6 +241,8 @@ def test_each_result_is_listed_and_each_run_used():
         env = "circuit|jam|point_gather"
         general = re.sub(rf"({env})(?=_|$)", "{env}", name)
         general = re.sub(r"^mpc_.*", "mpc_{env}_{steps}", general)
+        general = re.sub(r"^(dqn|cpo|pid)_", "{name}_", general)
+        general = re.sub(r"^long_.*", "long_{name}", general)
         assert f'"{name}"' in text or general in text, name
 
 
@@ -249,7 +251,7 @@ def circuit_runs(finished, tmp_path):
     """What fig6, timing and walls load: the tiny run of Circuit, also as that of DQN."""
     shutil.copytree(finished, tmp_path / "circuit")
     picture(tmp_path / "circuit" / "animation.gif")
-    shutil.copytree(finished / "agent", tmp_path / "compare_circuit" / "dqn" / "agent")
+    shutil.copytree(finished / "agent", tmp_path / "dqn_circuit" / "dqn" / "agent")
     return lambda name: tmp_path / name
 
 

@@ -7,7 +7,7 @@ import sys
 import pytest
 from tiny import programs_of_a_moment  # noqa: F401
 
-from experiments import compare
+from experiments import compare, settings
 from rp_jax.baselines.actor_critic import ActorCriticConfig
 from rp_jax.baselines.cpo import CPOConfig
 from rp_jax.baselines.pid_lagrangian import PIDConfig
@@ -61,6 +61,22 @@ def test_every_method_has_its_rows(finished, tmp_path, monkeypatch, capsys):
     shown = capsys.readouterr().out
     for variant in {row["variant"] for row in rows}:
         assert f"circuit {variant}" in shown
+
+
+def test_an_interrupted_comparison_goes_on(tmp_path, monkeypatch):
+    config = compare.Config("jam", methods=("PID",), steps=6000, out=tmp_path)
+    settings.begin(tmp_path, "experiments.compare", dataclasses.asdict(config))
+    went_on = []
+    monkeypatch.setattr(compare, "run", lambda *of: went_on.append(of) or [])
+    monkeypatch.setattr(compare, "show", lambda rows: None)
+    monkeypatch.setattr(sys, "argv", ["compare", "--resume", str(tmp_path)])
+    compare.main()
+    ((found, own, task, folder, checkpoints),) = went_on
+    assert found == config
+    assert own == compare.settings_of(config)
+    assert task.name == "jam"
+    assert folder == tmp_path
+    assert checkpoints.folder.parent == tmp_path
 
 
 @pytest.mark.parametrize(

@@ -202,10 +202,10 @@ def test_commands_are_understood(name, preset):
             assert word[1:].partition("/")[0] in commands.COMMANDS
     if preset == "full" and name in ("jam", "circuit", "point_gather", "jam_plans"):
         assert (config.seeds, config.episodes) == (10, 10_000)
-    if preset == "full" and name.startswith("compare"):
-        of = parsed(name.removeprefix("compare_"), preset)
+    if preset == "full" and name.startswith(("dqn", "cpo", "pid")):
+        of = parsed(config.env, preset)
         assert (config.seeds, config.steps) == (10, of.planning.steps)  # as many as RP has
-        assert parsed(f"long_{config.env}", preset).steps == 10 * config.steps
+        assert parsed(f"long_{name}", preset).steps == 10 * config.steps
 
 
 def test_one_switch_differs_from_the_first_table():
