@@ -1,7 +1,9 @@
 """All methods on one task, with as many steps to learn in and the same evaluation.
 
 RP, penalised DQN (several penalties in one program), CPO, PID-Lagrangian PPO, and MPC, which
-learns nothing. Counts the crashes while learning as well as those after it.
+learns nothing. Counts the crashes while learning as well as those after it. What is evaluated acts
+without exploring: greedily, CPO and PID-Lagrangian by their modes. Seconds of learning are those of
+all runs that learn side by side in one program, whose number stands beside them.
 
 python -m experiments.compare --env jam
 python -m experiments.compare --env jam --methods DQN --steps 12000000   # ten times as many
@@ -104,7 +106,7 @@ def by_q_learning(
     """Rows of RP or of penalised DQN; all members learn in one program."""
     pmdp = tasks.make_pmdp(task, config, models, task.train)
     trained, rows = pipeline.plan_and_evaluate(task, config, pmdp, members, folder, checkpoints)
-    return with_learning(rows, trained)
+    return with_learning(rows, trained, members)
 
 
 def by_policy_gradient(
@@ -118,13 +120,15 @@ def by_policy_gradient(
     pmdp = tasks.make_pmdp(task, config, None, task.train)
     agents = policy_gradient.learn(method, pmdp, config, folder, checkpoints.at("planning"))
     rows = evaluation.evaluate_all(task, config, pmdp, agents, checkpoints.at("evaluation"))
-    return with_learning(rows, agents.trained)
+    return with_learning(rows, agents.trained, agents.members)
 
 
 def with_learning(
-    rows: Sequence[Mapping[str, Any]], trained: training.Trained
+    rows: Sequence[Mapping[str, Any]],
+    trained: training.Trained,
+    members: Sequence[training.Member],
 ) -> list[dict[str, Any]]:
-    """Rows of evaluation with what their learners met while learning."""
+    """Rows of evaluation with what their learners met while learning, and how many they were."""
     found = []
     for row in rows:
         who = (row["method"], row["seed"])
@@ -133,6 +137,7 @@ def with_learning(
             "training_steps": mine[-1]["steps"],
             "training_episodes": sum(h["episodes"] for h in mine),
             "training_crashes": sum(h["crashes"] for h in mine),
+            "side_by_side": len(members),
         }
         found.append({**row, **met})
     return found
@@ -142,8 +147,8 @@ def by_search(config: Config, horizon: int) -> list[dict[str, Any]]:
     """Rows of MPC."""
     settings = mpc.Config(config.env, horizon, config.mpc_episodes, seed=config.seed)
     rows = mpc.run(settings, *mpc.prepare(settings))
-    nothing = {"training_steps": 0, "training_episodes": 0, "training_crashes": 0}
-    return [{**row, **nothing} for row in rows]
+    counts = ("training_steps", "training_episodes", "training_crashes", "side_by_side")
+    return [{**row, **dict.fromkeys(counts, 0)} for row in rows]
 
 
 def run(
@@ -194,6 +199,7 @@ def show(rows: Sequence[dict[str, Any]]) -> None:
             if row["variant"] != variant:
                 continue
             learned = f"{row['training_crashes']:,} in {row['training_episodes']:,}"
+            took = f"{row['train_seconds']:.1f} for {row['side_by_side']}"
             lines.append(
                 {
                     "method": row["method"],
@@ -203,7 +209,7 @@ def show(rows: Sequence[dict[str, Any]]) -> None:
                     "% [95 %]": tables.percent(row),
                     "steps": f"{row['training_steps']:,}" if row["training_steps"] else "-",
                     "crashes while learning": learned if row["training_steps"] else "-",
-                    "learning, s": f"{row['train_seconds']:.1f}",
+                    "learning, s": took if row["training_steps"] else "-",
                     "ms an action": f"{10 * row['seconds_per_100_actions']:.2f}",
                 }
             )

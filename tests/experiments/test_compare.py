@@ -41,6 +41,7 @@ def test_every_method_has_its_rows(finished, tmp_path, monkeypatch, capsys):
             assert row["seconds_per_100_actions"] > 0
             assert (row["training_steps"] >= 6000) == ("MPC" not in method)
             assert row["training_crashes"] <= row["training_episodes"]
+            assert row["side_by_side"] == {"DQN": 2, "MPC": 0}.get(method[:3], 1)
     for name, method in {"cpo": "CPO", "pid": "PID-Lagrangian"}.items():
         text = (out / name / "metrics.jsonl").read_text()
         history = [json.loads(line) for line in text.splitlines()]
