@@ -23,25 +23,20 @@ from rp_jax.validate import number
 ROUND = 1000  # episodes side by side
 
 
-@dataclass(frozen=True)
-class Config:
+@dataclass(frozen=True, kw_only=True)
+class Config(runs.Choice):
     """What is to be shown."""
 
-    run: Path  # folder of a finished run
     c: float  # crash rate not to be exceeded
     confidence: float = 0.99  # of the statement
-    variant: str = ""  # the test, such as N=8; default: the first
-    agent: int = 0  # which of the run's seeds, counted from 0
     expected: float | None = None  # crash rate that shall pass with 90 %; default: c / 2
-    seed: int = 0  # of the episodes
     out: Path | None = None  # JSON file for the statement
 
     def validate(self) -> None:
         """Raises ValueError, naming the field, if a value is out of range."""
+        super().validate()
         number("c", self.c, above=0)
         number("confidence", self.confidence, above=0)
-        number("agent", self.agent, least=0, integer=True)
-        number("seed", self.seed, least=0, most=2**31 - 1, integer=True)
 
 
 def run(config: Config) -> dict[str, Any]:

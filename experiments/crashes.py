@@ -25,31 +25,26 @@ from rp_jax.validate import number
 ROUND = 1000  # episodes side by side
 
 
-@dataclass(frozen=True)
-class Config:
+@dataclass(frozen=True, kw_only=True)
+class Config(runs.Choice):
     """What is looked at."""
 
-    run: Path  # folder of a finished run
     out: Path  # new folder for the results
-    variant: str = ""  # the test, such as N=8; default: the first
-    agent: int = 0  # which of the run's seeds, counted from 0
     episodes: int = 20_000  # among which crashes are sought
     most: int = 30  # crashes looked at
     steps: int = 10  # before a crash, looked at
     tries: int = 64  # episodes for each state and action, of which the best action is chosen
     checks: int = 512  # fresh ones of that action, and of the agent's own
-    seed: int = 0
     figures: bool = True
 
     def validate(self) -> None:
         """Raises ValueError, naming the field, if a value is out of range."""
-        number("agent", self.agent, least=0, integer=True)
+        super().validate()
         number("episodes", self.episodes, least=1, integer=True)
         number("most", self.most, least=1, integer=True)
         number("steps", self.steps, least=1, most=100, integer=True)
         number("tries", self.tries, least=1, integer=True)
         number("checks", self.checks, least=1, integer=True)
-        number("seed", self.seed, least=0, most=2**31 - 1, integer=True)
 
 
 class Crash(NamedTuple):

@@ -27,14 +27,11 @@ STARTS = "start states"  # what the worst starts are saved as
 MOST_STARTS = 100_000
 
 
-@dataclass(frozen=True)
-class Config:
+@dataclass(frozen=True, kw_only=True)
+class Config(runs.Choice):
     """What is measured."""
 
-    run: Path  # folder of a finished run
     out: Path  # new folder for the results
-    variant: str = ""  # the test, such as N=8; default: the first
-    agent: int = 0  # which of the run's seeds, counted from 0
     particles: int = 1000  # paths a stage
     repeats: int = 20  # independent estimates, for the interval
     generations: int = 10  # of the search for the worst starts; 0: no search
@@ -43,11 +40,10 @@ class Config:
     kept: int = 20  # worst starts that are kept
     checks: int = 2000  # fresh episodes from each of those
     starts: Path | None = None  # worst starts found before: these alone are played
-    seed: int = 0
 
     def validate(self) -> None:
         """Raises ValueError, naming the field, if a value is out of range."""
-        number("agent", self.agent, least=0, integer=True)
+        super().validate()
         number("particles", self.particles, least=10, integer=True)
         number("repeats", self.repeats, least=2, integer=True)
         number("generations", self.generations, least=0, integer=True)
@@ -55,7 +51,6 @@ class Config:
         number("tries", self.tries, least=1, integer=True)
         number("kept", self.kept, least=1, most=min(self.population, MOST_STARTS), integer=True)
         number("checks", self.checks, least=1, integer=True)
-        number("seed", self.seed, least=0, most=2**31 - 1, integer=True)
 
 
 class Subject(NamedTuple):

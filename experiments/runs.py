@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,21 @@ from rp_jax.threat import artefact
 from rp_jax.validate import number, one_of
 
 EXPERIMENTS: dict[str, Any] = {"circuit": circuit, "jam": jam, "point_gather": point_gather}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """Settings that name an agent of a finished run, a test, and what is drawn in it."""
+
+    run: Path  # folder of a finished run
+    variant: str = ""  # the test, such as N=8; default: the first
+    agent: int = 0  # which of the run's seeds, counted from 0
+    seed: int = 0  # of the episodes
+
+    def validate(self) -> None:
+        """Raises ValueError, naming the field, if a value is out of range."""
+        number("agent", self.agent, least=0, integer=True)
+        number("seed", self.seed, least=0, most=2**31 - 1, integer=True)
 
 
 class Subject(NamedTuple):
