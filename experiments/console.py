@@ -1,6 +1,8 @@
 """What an experiment shows on the terminal: progress with an estimate of the time left, tables."""
 
 import math
+import os
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -17,7 +19,9 @@ from rich.progress import (
 )
 from rich.table import Table
 
-console = Console()
+WIDE = 160  # columns of a file or a pipe, which has none of its own: no table is cut short
+
+console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else WIDE)
 
 
 def say(text: str, style: str | None = None) -> None:
