@@ -13,6 +13,7 @@ from experiments import cli, pipeline, recipes, tasks
 from rp_jax.envs import circuit
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.threat.build import ThreatConfig
+from rp_jax.validate import number
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,12 @@ class Config(tasks.Config):
     track: str = "default"  # while learning: default, narrowed or circle
     test_tracks: tuple[str, ...] = ("default", "narrowed", "circle")  # while testing
     wall: ThreatConfig = field(default_factory=lambda: recipes.TUNED_WALL)  # of a wall point
+    lost: float = 0.0  # share of learning episodes in which the agent is not told where it is
+
+    def validate(self) -> None:
+        """Raises ValueError, naming the field, if a value is out of range."""
+        super().validate()
+        number("lost", self.lost, least=0, most=1)
 
 
 def quick(recipe: str) -> Config:
@@ -41,18 +48,31 @@ def paper(config: Config) -> Config:
 
 
 def make_task(config: Config) -> tasks.Task:
-    """Environments and threats, checked."""
+    """Environments and threats, checked.
+
+    An agent that learned to do without x and y is not told them where the track leads elsewhere
+    than the one that it learned on: what it knows of places is wrong there.
+    """
     if not config.test_tracks:
         raise ValueError("test_tracks is (); it must name at least one track")
 
     def params(track: str) -> circuit.Params:
         return circuit.make_params(track, fidelity=config.fidelity, baseline=config.baseline)
 
+    def lost(params: circuit.Params, chance: float) -> circuit.Params:
+        return params.replace(lost=jax.numpy.asarray(chance, float))
+
+    home = params(config.track)
+    tests = {track: params(track) for track in config.test_tracks}
+    if config.lost > 0:
+        for track, found in tests.items():
+            if not np.array_equal(found.track.centre, home.track.centre):
+                tests[track] = lost(found, 1.0)
     return tasks.Task(
         name="circuit",
         env=circuit,
-        train=params(config.track),
-        tests={track: params(track) for track in config.test_tracks},
+        train=lost(home, config.lost),
+        tests=tests,
         threats={"wall": config.wall},
         draw=draw,
     )

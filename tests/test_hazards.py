@@ -350,7 +350,7 @@ def test_the_agent_of_the_circuit_and_of_its_sub_rmdp_move_alike_to_the_bit():
     model = circuit.sub_rmdps(params)["wall"].agent
     agents, actions = agents_of(model, params.track.centre)
     zero = jnp.zeros(90, jnp.int32)
-    states = circuit.State(agent=agents, index=zero, time=zero)
+    states = circuit.State(agent=agents, index=zero, time=zero, lost=zero > 0)
     step = jax.jit(jax.vmap(circuit.step, (None, 0, 0, None)))
     reached, _ = step(jax.random.key(0), states, actions, params)
     alone = jax.jit(jax.vmap(model.step))(agents, pick(model.actions, actions))

@@ -12,7 +12,7 @@ COMMANDS: dict[str, str] = {
     "point_gather": "point_gather {seeds} {gather_steps} {bomb}",
     "point_gather_x01": "point_gather {seeds} {gather_steps} --x 0.1 --threat @point_gather/threat"
     " --no-figures",
-    "circuit_plans": "circuit {seeds} {circuit_steps} --baseline plans",
+    "circuit_plans": "circuit {seeds} {circuit_steps} --baseline plans --lost 0.1",
     "jam_plans": "jam {seeds} {jam_steps} {obstacle} --baseline plans --x 0.001 --learning-toll 1"
     " --learning-penalty 50 --test-obstacles 3 8 15 30 50",
     "jam_ahead": "jam {few} {jam_steps} --baseline plans --x 0.002 --lookahead 8 --learning-toll 1"

@@ -37,6 +37,7 @@ class State(struct.PyTreeNode):
     agent: Vehicle
     index: Array  # () int32, of the nearest centre point
     time: Array  # () int32, steps since the start
+    lost: Array  # () bool, x and y are not observed
 
 
 class Params(struct.PyTreeNode):
@@ -49,6 +50,7 @@ class Params(struct.PyTreeNode):
     time_limit: Array  # () int32, steps
     stop_speed: Array  # () slower than this costs 1
     beta: Array  # () discount of danger
+    lost: Array  # () chance that x and y are not observed in an episode
     fidelity: str = struct.field(pytree_node=False, default="released")
 
 
@@ -61,6 +63,7 @@ def make_params(
     beta: float = 0.999,
     fidelity: str = "released",
     baseline: str = "paper",
+    lost: float = 0.0,
 ) -> Params:
     """The task's parameters, checked.
 
@@ -73,6 +76,8 @@ def make_params(
         fidelity: "released" earns nothing for crossing the lap line, as the published numbers
             did; "paper" counts it as any other progress.
         baseline: "paper" draws accelerations and turns at random; "plans" brakes, with each turn.
+        lost: chance that x and y read 0 throughout an episode. An agent that learned with some
+            such episodes can be used on other tracks, where places learned by heart mislead.
 
     Raises:
         ValueError: a value is out of range, or the track cannot be driven.
@@ -83,6 +88,7 @@ def make_params(
     positive("horizon", horizon, most=base.FARTHEST, integer=True)
     number("radius", radius, least=base.SMALLEST, most=tracks.LARGEST)
     positive("beta", beta, most=1.0)
+    number("lost", lost, least=0, most=1)
     if not isinstance(track, tracks.TrackPlan):
         track = tracks.PLANS[one_of("track", track, tracks.PLANS)]()
     plans = baseline == "plans"
@@ -106,14 +112,19 @@ def make_params(
         time_limit=jnp.asarray(time_limit, jnp.int32),
         stop_speed=jnp.asarray(0.005, float),
         beta=jnp.asarray(beta, float),
+        lost=jnp.asarray(lost, float),
         fidelity=fidelity,
     )
 
 
 def start_at(agent: Vehicle, params: Params) -> State:
-    """A state with the vehicle anywhere, at time 0."""
-    index = params.track.nearest_centre.nearest(agent.position)
-    return State(agent=agent, index=index, time=jnp.asarray(0, jnp.int32))
+    """A state with the vehicle anywhere, at time 0; lost only where all are."""
+    return State(
+        agent=agent,
+        index=params.track.nearest_centre.nearest(agent.position),
+        time=jnp.asarray(0, jnp.int32),
+        lost=params.lost >= 1,
+    )
 
 
 def demo_start(params: Params) -> State:
@@ -124,12 +135,13 @@ def demo_start(params: Params) -> State:
 
 def reset(key: Array, params: Params) -> State:
     """A random centre point, up to 45 degrees off the track's direction, at rest."""
-    where, turn = jax.random.split(key)
+    where, turn, instrument = jax.random.split(key, 3)
     i = jax.random.randint(where, (), 0, params.track.centre.shape[0])
     angle = jax.random.uniform(turn, (), float, -jnp.pi / 4, jnp.pi / 4)
     heading = rotate(params.track.direction[i], jnp.stack([jnp.cos(angle), jnp.sin(angle)]))
     position = params.track.centre[i]
-    return start_at(Vehicle(position=position, heading=heading, speed=jnp.zeros(())), params)
+    state = start_at(Vehicle(position=position, heading=heading, speed=jnp.zeros(())), params)
+    return state.replace(lost=jax.random.bernoulli(instrument, params.lost))
 
 
 def step(key: Array, state: State, action: Array, params: Params) -> tuple[State, base.Outcome]:
@@ -140,7 +152,7 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
     del key
     control = params.agent.control(action)
     reached = start_at(params.agent.step(state.agent, control), params)
-    reached = reached.replace(time=state.time + 1)
+    reached = reached.replace(time=state.time + 1, lost=state.lost)
     crashed = causes(reached, params)["wall"]
     n = params.track.centre.shape[0]
     passed = reached.index - state.index
@@ -166,12 +178,13 @@ def alone(state: State) -> State:
 
 
 def observe(state: State, params: Params) -> Array:
-    """(364,) LIDAR (360), x, y, direction of the track relative to the heading, speed."""
+    """(364,) LIDAR (360), x, y (0 if lost), direction of the track from the heading, speed."""
     agent, track = state.agent, params.track
     points = track.walls_in_view.near(agent.position)
     scan = sensing.lidar(points, agent.position, agent.heading, LIDAR_BINS, tracks.VIEW)
     bend = angle_of(to_ego(track.onward[state.index], agent.heading))
-    return jnp.concatenate([scan, agent.position, jnp.stack([bend, agent.speed])])
+    place = jnp.where(state.lost, 0.0, agent.position)
+    return jnp.concatenate([scan, place, jnp.stack([bend, agent.speed])])
 
 
 def hazards(state: State, params: Params) -> dict[str, base.Hazards]:

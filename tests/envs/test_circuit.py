@@ -216,6 +216,7 @@ def test_a_plan_of_ones_own_is_driven_like_the_others():
         ({"horizon": 0}, "^horizon is 0; it must be an integer, above 0"),
         ({"radius": -0.1}, r"^radius is -0\.1; it must be a finite number, at least 0\.02"),
         ({"beta": 1.5}, r"^beta is 1\.5; it must be a finite number, above 0, at most 1"),
+        ({"lost": 1.5}, r"^lost is 1\.5; it must be a finite number, at least 0, at most 1"),
         ({"radius": 0.3}, r"^track: half_width is 0\.3; it must exceed .* radius, 0\.3"),
     ],
 )
@@ -230,3 +231,29 @@ def test_there_are_fifteen_actions_of_three_accelerations_and_five_turns():
     np.testing.assert_allclose(params.agent.actions.acceleration[::5], [-0.02, 0, 0.02])
     turns = angle_of(params.agent.actions.rotation[:5])
     np.testing.assert_allclose(turns, [-0.15, -0.05, 0, 0.05, 0.15], atol=1e-6)
+
+
+def test_who_is_lost_does_not_see_x_and_y_throughout_the_episode_and_all_else_alike():
+    params = params_of()
+    keys = jax.random.split(jax.random.key(0), ROWS)
+
+    @jax.jit
+    def two_steps(chance):
+        of = params.replace(lost=chance)
+        state = jax.vmap(circuit.reset, (0, None))(keys, of)
+        seen = [jax.vmap(circuit.observe, (0, None))(state, of)]
+        for action in (12, 14):
+            moved = jax.vmap(circuit.step, (0, 0, None, None))
+            state, _ = moved(keys, state, action, of)
+            seen.append(jax.vmap(circuit.observe, (0, None))(state, of))
+        return state.lost, jnp.stack(seen)
+
+    _, told = two_steps(0.0)
+    for chance in (0.0, 0.25, 1.0):
+        lost, seen = two_steps(chance)
+        assert stats.binomtest(int(lost.sum()), ROWS, chance).pvalue > 1e-6
+        place = np.where(np.asarray(lost)[:, None], 0.0, told[..., 360:362])
+        np.testing.assert_array_equal(seen[..., 360:362], place)
+        rest = np.delete(np.arange(364), (360, 361))
+        np.testing.assert_array_equal(seen[..., rest], told[..., rest])
+    assert (np.abs(told[..., 360:362]).sum(axis=-1) > 0).any(axis=0).all()

@@ -117,6 +117,7 @@ def test_circuit_replays_every_recorded_transition(golden, precision):
         agent=vehicle(data),
         index=data["prev_index"].astype(np.int32),
         time=np.zeros(count, np.int32),
+        lost=np.zeros(count, bool),
     )
     step = jax.jit(jax.vmap(circuit.step, (None, 0, 0, None)))
     reached, outcome = step(jax.random.key(0), states, data["action"].astype(np.int32), params)

@@ -19,6 +19,7 @@ from rp_jax.planning import loop
         ("baseline", ("brave", "")),
         ("episodes", (0, -10, 2.5)),
         ("fidelity", ("text", "")),
+        ("lost", (-0.1, 1.5, float("nan"))),
         ("planning", (loop.LoopConfig(steps=7), loop.LoopConfig(num_envs=0))),
     ],
 )
@@ -48,3 +49,14 @@ def test_methods_are_named_by_what_sets_them_apart():
     assert name(x=0.001) == "RP (x=0.001)"
     assert name(x=0.001, learning_penalty=5.0) == "RP (x=0.001, 5)"
     assert name(x=float("inf"), learning_penalty=50.0) == "DQN (penalty 50)"
+
+
+def test_what_learned_to_do_without_x_and_y_is_told_them_only_on_its_own_track():
+    def lost(**changes):
+        task = circuit.make_task(circuit.Config(**changes))
+        return float(task.train.lost), {name: float(p.lost) for name, p in task.tests.items()}
+
+    assert lost() == (0.0, {"default": 0.0, "narrowed": 0.0, "circle": 0.0})
+    assert lost(lost=0.25) == (0.25, {"default": 0.0, "narrowed": 0.0, "circle": 1.0})
+    swapped = {"track": "circle", "test_tracks": ("circle", "narrowed")}
+    assert lost(lost=0.25, **swapped) == (0.25, {"circle": 0.0, "narrowed": 1.0})
