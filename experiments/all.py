@@ -34,6 +34,7 @@ from experiments.paper import (
     fig6,
     more_steps,
     paper_recipe,
+    published,
     second_reward,
     table1,
     table2,
@@ -157,7 +158,10 @@ def blocks(folder: Path, preset: str, failed: dict[str, str]) -> list[report.Blo
         out += [report.Heading("Failed"), *(f"{name}: {why}" for name, why in failed.items())]
     lines = ledger(folder / "runs")
     hours, cpu = (sum(float(line[k]) for line in lines) / 60 for k in ("minutes", "CPU minutes"))
-    took = f"{len(lines)} runs took {hours:.1f} hours, {cpu:.1f} CPU hours."
+    took = (
+        f"{len(lines)} runs took {hours:.1f} hours one after another, {cpu:.1f} CPU hours. The "
+        f"paper: {published.TRAINING_HOURS:g} hours on a GPU for one seed of one task."
+    )
     return [*out, report.Heading("What was run"), took, report.Grid("Runs", lines)]
 
 

@@ -4,9 +4,12 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from experiments import tables
 from experiments.paper import published, scores
 from experiments.paper.section import Claim, Section, Table, holds
+from rp_jax import statistics
 
 TITLE = "Figure 5: learning curves"
 # The variant that is learned on, runs of RP, steps of MPC.
@@ -16,6 +19,7 @@ TASKS: dict[str, tuple[str, tuple[str, ...], tuple[int, ...]]] = {
     "jam": ("N=8", ("jam",), (2, 3)),
 }
 ALMOST = 80  # per cent
+TENTH = 0.1  # of the steps, over which returns are compared
 COMPETITIVE = 0.9  # of the best return that keeps c
 KEPT = ("method", "seed", "steps", "episodes", "return_mean", "crashes")
 
@@ -62,7 +66,12 @@ def tell(results: dict[str, Any]) -> Section:
     return Section(
         f"{len(seeds)} seed(s); lines are means over seeds, bands 90 % intervals. Curves show the "
         "agents as they explore; the table, the learned agents. MPC does not learn.",
-        tables=[Table("After learning, on the task that was learned", learned)],
+        tables=[
+            Table("After learning, on the task that was learned", learned),
+            Table(
+                "Whether returns still rise", [r for e, of in results.items() for r in rise(e, of)]
+            ),
+        ],
         claims=[*claims, *_gather(results["point_gather"])],
         figures={
             "figure_5.png": "Return and crash rate against agent steps.",
@@ -82,6 +91,41 @@ def line(env: str, row: dict[str, Any]) -> dict[str, Any]:
         "crashes": tables.crashed(row),
         "crash rate, % [95 %]": tables.percent(row),
     }
+
+
+def rise(env: str, of: dict[str, Any]) -> list[dict[str, Any]]:
+    """Of a table: a method's return while exploring, in the last tenth of its steps and before."""
+    lines = []
+    for method in dict.fromkeys(row["method"] for row in of["history"]):
+        rows = [row for row in of["history"] if row["method"] == method and row["episodes"]]
+        steps = sorted({row["steps"] for row in rows})
+        count = max(1, round(TENTH * len(steps)))
+        late, before = (
+            _by_seed([row for row in rows if row["steps"] in tenth])
+            for tenth in (steps[-count:], steps[-2 * count : -count])
+        )
+        change, width = statistics.mean_interval(late - before)
+        lines.append(
+            {
+                "task": env,
+                "method": method,
+                "steps": f"{steps[-1]:,}",
+                "last tenth": f"{late.mean():.2f}",
+                "change from the tenth before": f"{change:+.2f} +- {width:.2f}",
+                "of the return, %": f"{100 * change / abs(late.mean()):+.1f}",
+            }
+        )
+    return lines
+
+
+def _by_seed(rows: list[dict[str, Any]]) -> np.ndarray:
+    """(seeds,) mean returns of the episodes of some chunks."""
+    found = []
+    for seed in sorted({row["seed"] for row in rows}):
+        of = [row for row in rows if row["seed"] == seed]
+        weights = [row["episodes"] for row in of]
+        found.append(np.average([row["return_mean"] for row in of], weights=weights))
+    return np.asarray(found)
 
 
 def _by_step(history: list[dict], method: str) -> list[tuple[int, float, float]]:

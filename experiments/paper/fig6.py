@@ -1,4 +1,4 @@
-"""Figure 6: trajectories on the track that was learned and on a circle: RP, MPC, DQN."""
+"""Figure 6: trajectories on the track that was learned and on others: RP, MPC, DQN."""
 
 import functools
 from pathlib import Path
@@ -16,7 +16,7 @@ from rp_jax.envs import circuit
 from rp_jax.planning import loop
 
 TITLE = "Figure 6: trajectories on Circuit"
-TRACKS = ("default", "circle")
+TRACKS = ("default", "narrowed", "circle")
 EPISODES, STEPS_AHEAD = 8, 4
 
 
@@ -90,10 +90,10 @@ def tell(results: list[dict[str, Any]]) -> Section:
         "first agent of each.",
         claims=[
             Claim(
-                "Figure 6: RP crashes on neither track; unpenalised DQN crashes on the new one",
+                "Figure 6: RP crashes on no track; unpenalised DQN crashes on the new ones",
                 "no crash; crashes",
                 said,
-                holds(sum(of_rp) == 0 and of_dqn[-1] > 0),
+                holds(sum(of_rp) == 0 and min(of_dqn[1:]) > 0),
             )
         ],
         figures={

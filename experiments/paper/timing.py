@@ -19,10 +19,11 @@ from rp_jax.baselines.mpc import make_search
 from rp_jax.planning.pmdp import PMDP
 
 TITLE = "Computation time"
-SEARCHES = {"circuit": (3, 4, 5), "jam": (2, 3)}
+SEARCHES = {"circuit": (3, 4, 5), "jam": (2, 3), "point_gather": (1, 2)}
 VARIANTS = {"jam": "N=8"}  # elsewhere the first
 ROUNDS = 3
 STEPS = 3_000_000  # that the paper's agents learn in
+MINUTES = 10.0  # this project's goal for threats and planning of ten seeds of Circuit and Jam
 
 
 def run(sources: Any, folder: Path) -> dict[str, Any]:
@@ -99,8 +100,8 @@ def tell(results: dict[str, Any]) -> Section:
         (row["env"], row["method"]): float(np.median(row["seconds"])) for row in results["actions"]
     }
     for (env, method), seconds in median.items():
-        paper = published.SECONDS[env].get(method)
-        again = published.RELEASED_SECONDS[env].get(method)
+        paper = published.SECONDS.get(env, {}).get(method)
+        again = published.RELEASED_SECONDS.get(env, {}).get(method)
         lines.append(
             {
                 "task": env,
@@ -119,11 +120,12 @@ def tell(results: dict[str, Any]) -> Section:
                     EXCEEDED if seconds < paper else MISSED,
                 )
             )
-    for env in dict.fromkeys(row["env"] for row in results["actions"]):
-        paper_of = published.SECONDS[env]
+    for env, paper_of in published.SECONDS.items():
+        if (env, RP) not in median:
+            continue
         (method,) = (name for name in paper_of if name.startswith("MPC"))
-        ratio = median[env, method] / median[env, "RP"]
-        theirs = paper_of[method] / paper_of["RP"]
+        ratio = median[env, method] / median[env, RP]
+        theirs = paper_of[method] / paper_of[RP]
         claims.append(
             Claim(
                 f"Computation time, {env}: RP acts faster than {method}",
@@ -136,13 +138,32 @@ def tell(results: dict[str, Any]) -> Section:
     for row in results["learning"]:
         line, more = _learning(row)
         learned.append(line)
-        claims += more
+        claims += more if row["env"] in published.SECONDS else []
     return Section(
         f"Wall time of 100 decisions one after another, observation and threat included; median of "
         f"{ROUNDS} rounds. The paper's machine is not known.",
-        tables=[Table("Seconds per 100 actions", lines), Table("Learning, wall time", learned)],
+        tables=[
+            Table("Seconds per 100 actions", lines),
+            Table("Learning, wall time", learned),
+            Table("Goal", [_goal(results["learning"])]),
+        ],
         claims=claims,
     )
+
+
+def _goal(learning: list[dict[str, Any]]) -> dict[str, Any]:
+    """Threat functions, and planning of all seeds, of both tasks that the paper times."""
+    of = [row for row in learning if row["env"] in published.SECONDS]
+    parts = ("reconnaissance", "planning_compilation", "planning")
+    minutes = sum(row[part] for row in of for part in parts) / 60
+    over = minutes - MINUTES
+    return {
+        "goal": "threat functions and planning, " + " and ".join(row["env"] for row in of),
+        "seeds": min(row["seeds"] for row in of),
+        "wanted, minutes": f"{MINUTES:g}",
+        "reached": f"{minutes:.1f}",
+        "met": "yes" if over <= 0 else f"missed by {over:.1f}",
+    }
 
 
 def _learning(row: dict[str, Any]) -> tuple[dict[str, Any], list[Claim]]:

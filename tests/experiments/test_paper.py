@@ -102,6 +102,21 @@ def test_the_curves_claims_look_at_every_chunk(sources, tmp_path):
     assert safer.verdict == section.MISSED  # level
 
 
+def test_whether_returns_still_rise_is_said_of_the_last_tenth_of_the_steps():
+    chunks = range(1, 21)
+    history = [
+        {"method": "A", "seed": seed, "steps": 100 * i, "episodes": i, "return_mean": i + seed}
+        for seed in (0, 1)
+        for i in chunks
+    ]
+    (line,) = fig5.rise("jam", {"history": history})
+    late = (19 * 19 + 20 * 20) / 39
+    assert line["last tenth"] == f"{late + 0.5:.2f}"
+    before = (17 * 17 + 18 * 18) / 35
+    assert line["change from the tenth before"] == f"{late - before:+.2f} +- 0.00"
+    assert line["steps"] == "2,000"
+
+
 @pytest.mark.parametrize("rate", [0.0, 0.02, 0.5, 1.0])
 def test_another_penalty_gives_what_it_would_have_given_at_once(rate):
     row = evaluated("a", "b", 0, rate)
