@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 
 from benchmarks import setups
-from experiments import console
+from experiments import cli, console
 from rp_jax import storage
 from rp_jax.planning import loop
 from rp_jax.planning.pmdp import PMDP
@@ -66,7 +66,8 @@ def train(config: Config) -> Iterator[dict[str, float]]:
     init = jax.jit(lambda key, pmdp: loop.init(key, pmdp, learning))
     state, metrics = init(jax.random.key(0), pmdp)
     began, steps, wrong = time.monotonic(), int(metrics.steps), int(metrics.inadmissible)
-    while steps < config.steps and time.monotonic() - began < 60 * config.minutes:
+    going = True  # once at least
+    while going:
         state, metrics = chunk(state, pmdp)
         steps += int(metrics.steps)
         wrong += int(metrics.inadmissible)
@@ -78,6 +79,7 @@ def train(config: Config) -> Iterator[dict[str, float]]:
             "megabytes": memory(),
             "traces": traces,
         }
+        going = steps < config.steps and time.monotonic() - began < 60 * config.minutes
 
 
 def summary(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
@@ -98,9 +100,10 @@ def summary(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
 def main() -> None:
     """Exits with 1 if an inadmissible action was taken or something was compiled again."""
     config = tyro.cli(Config, prog="python -m benchmarks.endurance", description=__doc__)
-    one_of("env", config.env, setups.quick_tasks())
-    number("minutes", config.minutes, above=0)
-    number("steps", config.steps, least=1, integer=True)
+    with cli.bad_input():
+        one_of("env", config.env, setups.quick_tasks())
+        number("minutes", config.minutes, above=0)
+        number("steps", config.steps, least=1, integer=True)
     rows: list[dict[str, float]] = []
 
     def report() -> dict[str, Any]:

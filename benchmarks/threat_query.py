@@ -12,7 +12,7 @@ from rp_jax import evaluate
 def run(batches: tuple[int, ...] = (1, 16, 256, 4096, 16_384)) -> list[Row]:
     """States per second, all actions and all hazards of each, by batch.
 
-    "pairs" are those of a state and a hazard inside its window; only they reach a network.
+    "pairs" are those of a state and a hazard in its reach; only they are shown to a network.
     """
     rows = []
     for name, (task, config) in quick_tasks().items():

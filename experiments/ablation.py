@@ -40,8 +40,10 @@ def at_random(
     for variant, params in task.tests.items():
         for x in (float("inf"), config.x):
             pmdp = tasks.make_pmdp(task, config, models, params)
-            found = evaluate.summarise(play(pmdp.replace(x=jnp.float32(x))), config.penalty)
+            episodes = play(pmdp.replace(x=jnp.float32(x)))
             method = "random" if x == float("inf") else f"random, shield (x={x:g})"
+            evaluate.check(episodes, method)
+            found = evaluate.summarise(episodes, config.penalty)
             rows.append({"variant": variant, "method": method, "x": x, "seed": config.seed} | found)
     return rows
 

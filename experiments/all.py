@@ -47,7 +47,7 @@ from experiments.paper import (
 )
 from experiments.paper.commands import COMMANDS, SIZES
 from experiments.paper.scores import read
-from experiments.paper.section import CLOSE
+from experiments.paper.section import CLOSE, Section
 from experiments.paper.sources import LOG, RunError, Sources
 from rp_jax import storage
 from rp_jax.validate import one_of
@@ -122,15 +122,37 @@ def result(module: Any, sources: Sources, folder: Path) -> None:
         storage.write_json(saved, module.run(sources, folder))
     if hasattr(module, "plot"):
         module.plot(read(saved), folder)
-    for name in module.tell(read(saved)).figures:
+    told(module, folder)
+
+
+def told(module: Any, folder: Path) -> Section:
+    """What a saved result has to say.
+
+    Raises:
+        FileNotFoundError: a figure of it was not drawn.
+    """
+    section = module.tell(read(folder / "results.json"))
+    for name in section.figures:
         if not (folder / name).exists():
             raise FileNotFoundError(f"{folder / name}: it was not drawn")
+    return section
+
+
+def all_told(folder: Path, failed: dict[str, str]) -> dict[str, Section]:
+    """Of each saved result; what cannot be told joins those that failed."""
+    found = {}
+    for name, module in RESULTS.items():
+        if name not in failed and (folder / name / "results.json").exists():
+            try:
+                found[name] = told(module, folder / name)
+            except Exception as error:  # of other code, or half made: the others are told
+                failed[name] = f"{type(error).__name__}: {error}"
+    return found
 
 
 def blocks(folder: Path, preset: str, failed: dict[str, str]) -> list[report.Block]:
     """The report on all results that are saved in the folder."""
-    found = {name: folder / name / "results.json" for name in RESULTS if name not in failed}
-    told = {name: RESULTS[name].tell(read(p)) for name, p in found.items() if p.exists()}
+    told = all_told(folder, failed)
     claims = [claim for section in told.values() for claim in section.claims]
     counts = Counter(claim.verdict.partition(" (")[0] for claim in claims)
     missing = [name for name in RESULTS if name not in told and name not in failed]

@@ -54,7 +54,7 @@ def run(config: Config) -> dict[str, Any]:
     @functools.partial(jax.jit, static_argnames="episodes")
     def play(key, params, pmdp, episodes):
         values = evaluate.greedy(network, params)
-        return evaluate.run_episodes(key, pmdp, values, episodes, batch=episodes).danger
+        return evaluate.run_episodes(key, pmdp, values, episodes, batch=episodes)
 
     key = tasks.key_of(config.seed, tasks.CERTIFICATE)
     size, began = min(ROUND, n), time.perf_counter()
@@ -62,8 +62,9 @@ def run(config: Config) -> dict[str, Any]:
     done = crashes = 0
     with console.progress("certify") as bar:
         for i in range(rounds):
-            danger = np.asarray(play(jax.random.fold_in(key, i), params, pmdp, episodes=size))
-            danger = danger[: n - done]
+            found = play(jax.random.fold_in(key, i), params, pmdp, episodes=size)
+            evaluate.check(found, "certify")
+            danger = np.asarray(found.danger)[: n - done]
             done, crashes = done + len(danger), crashes + int((danger > 0).sum())
             bar("", i + 1, rounds, f"{crashes} crashes of {allowed} allowed")
             if crashes > allowed:
@@ -113,6 +114,8 @@ def main() -> None:
     """Exits with 1 where nothing is shown, with 2 on bad input."""
     config = tyro.cli(Config, description=__doc__)
     with cli.bad_input():
+        if config.out is not None and not config.out.parent.is_dir():
+            raise ValueError(f"out is {config.out}; its folder must exist")
         row = run(config)
         if config.out is not None:
             storage.write_json(config.out, row)

@@ -113,7 +113,7 @@ def resumable(name: str, folder: Path, checkpoints: Checkpoints) -> Iterator[Non
         except KeyboardInterrupt as stop:
             console.say(f"interrupted ({stop or 'between two steps'}); {again}", style="yellow")
             raise SystemExit(130) from None
-        except (FloatingPointError, storage.StorageError) as error:
+        except (FloatingPointError, OSError, storage.StorageError) as error:
             console.say(f"error: {error}; {again}", style="red")
             raise SystemExit(1) from None
         checkpoints.clear()
@@ -137,9 +137,12 @@ def needs_matplotlib(figures: bool) -> None:
 
 @contextmanager
 def bad_input() -> Iterator[None]:
-    """Turns a ValueError into a message and exit code 2."""
+    """Turns a ValueError into a message and exit code 2; numbers that are none, into 1."""
     try:
         yield
+    except FloatingPointError as error:
+        console.say(f"error: {error}", style="red")
+        raise SystemExit(1) from None
     except ValueError as error:
         console.say(f"error: {error}", style="red")
         raise SystemExit(2) from None

@@ -143,10 +143,10 @@ def with_learning(
     return found
 
 
-def by_search(config: Config, horizon: int) -> list[dict[str, Any]]:
+def by_search(config: Config, horizon: int, checkpoints: Checkpoints) -> list[dict[str, Any]]:
     """Rows of MPC."""
     settings = mpc.Config(config.env, horizon, config.mpc_episodes, seed=config.seed)
-    rows = mpc.run(settings, *mpc.prepare(settings))
+    rows = mpc.run(settings, *mpc.prepare(settings), checkpoints)
     counts = ("training_steps", "training_episodes", "training_crashes", "side_by_side")
     return [{**row, **dict.fromkeys(counts, 0)} for row in rows]
 
@@ -187,7 +187,7 @@ def run(
             own = dataclasses.replace(settings, learning_penalty=penalty)
             add(by_policy_gradient(learner, task, own, out, at))
     if "MPC" in config.methods:
-        add(by_search(config, horizon))
+        add(by_search(config, horizon, checkpoints.at("mpc")))
     return rows
 
 

@@ -7,6 +7,7 @@ best it could have chosen, and beside the threat that it chose by. The rest was 
 python -m experiments.crashes --run docs/results/jam_ahead --variant N=8 --out results/crashes
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ import tyro
 from experiments import cli, console, runs, tasks
 from rp_jax import evaluate, rare, statistics, storage
 from rp_jax.planning.pmdp import PMDP
-from rp_jax.validate import number
+from rp_jax.validate import finite, number
 
 ROUND = 1000  # episodes side by side
 
@@ -81,6 +82,7 @@ def found(
         for i in range(rounds):
             bar("", i, rounds, f"{count} crashes of {i * size:,}")
             shown, causes = play(jax.random.fold_in(key, i), pmdp)
+            finite("crashes: threats", shown.threat)
             met = np.any(list(causes.values()), axis=0)
             crashed = np.flatnonzero(met.any(axis=0))
             count += len(crashed)
@@ -244,9 +246,11 @@ def main() -> None:
     config = tyro.cli(Config, description=__doc__)
     with cli.bad_input():
         config.validate()
+        cli.needs_matplotlib(config.figures)
         loaded = runs.load(config.run)
         loaded.subject(config.variant, config.agent)
         folder = storage.new_folder(config.out)
+        storage.write_json(folder / "config.json", dataclasses.asdict(config))
         run(config, loaded, folder)
 
 

@@ -1,9 +1,12 @@
 """MPC (appendix G.4; tables 1 and 2): tree search in the true model, on each variant of a task.
 
 python -m experiments.mpc --env jam --horizon 3 --variants N=8
+
+--resume DIR, alone, goes on with an interrupted run.
 """
 
 import dataclasses
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-import rp_jax
 from experiments import cli, console, evaluation, pipeline, tables, tasks
 from experiments.runs import EXPERIMENTS
+from experiments.settings import begin
 from rp_jax import evaluate, storage
 from rp_jax.baselines import mpc
+from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
 from rp_jax.validate import number, one_of
 
 GROUP = 50  # episodes between two reports of progress
@@ -65,7 +69,11 @@ def prepare(config: Config) -> tuple[tasks.Task, list[mpc.Search], float]:
 
 
 def play(
-    key: jax.Array, search: mpc.Search, episodes: int, bar: console.Bar
+    key: jax.Array,
+    search: mpc.Search,
+    episodes: int,
+    bar: console.Bar,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> tuple[evaluate.Episodes, float]:
     """All episodes, a group after another, and the seconds it took without compilation."""
     pmdp = mpc.omniscient(search)
@@ -76,16 +84,22 @@ def play(
 
     bar("", 0, episodes, "compiling")
     run = jax.jit(group).lower(key, pmdp, search).compile()
-    parts: list[evaluate.Episodes] = []
-    began = time.perf_counter()
-    for i in range(-(-episodes // size)):
+    rounds = -(-episodes // size)
+    shapes = jax.eval_shape(group, key, pmdp, search)
+    rows = jax.tree.map(lambda s: np.zeros((rounds, *s.shape), s.dtype), shapes)
+
+    def step(i: int, carried: tuple[Any, np.ndarray]) -> tuple[Any, np.ndarray]:
+        (rows, seconds), began = carried, time.perf_counter()
         found = run(jax.random.fold_in(key, i), pmdp, search)
-        parts.append(jax.tree.map(np.asarray, found))
-        crashes = sum(int((part.danger > 0).sum()) for part in parts)
-        done = min((i + 1) * size, episodes)
+        for whole, new in zip(jax.tree.leaves(rows), jax.tree.leaves(found), strict=True):
+            whole[i] = new
+        seconds[i] = time.perf_counter() - began
+        crashes, done = int((rows.danger > 0).sum()), min((i + 1) * size, episodes)
         bar("", done, episodes, f"{crashes} crashes in {(i + 1) * size}")
-    seconds = time.perf_counter() - began
-    return jax.tree.map(lambda *a: np.concatenate(a), *parts), seconds
+        return rows, seconds
+
+    rows, seconds = checkpoints.loop((rows, np.zeros(rounds, np.float32)), step, rounds)
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), rows), float(seconds.sum())
 
 
 def action_seconds(key: jax.Array, search: mpc.Search) -> tuple[float, float]:
@@ -96,7 +110,11 @@ def action_seconds(key: jax.Array, search: mpc.Search) -> tuple[float, float]:
 
 
 def run(
-    config: Config, task: tasks.Task, searches: list[mpc.Search], penalty: float
+    config: Config,
+    task: tasks.Task,
+    searches: list[mpc.Search],
+    penalty: float,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> list[dict[str, Any]]:
     """One row per variant."""
     rows = []
@@ -104,10 +122,12 @@ def run(
     key = tasks.key_of(config.seed, tasks.EVALUATION)
     for variant, search in zip(task.tests, searches, strict=True):
         with console.progress(f"{name}, {variant}") as bar:
-            episodes, seconds = play(key, search, config.episodes, bar)
+            at = checkpoints.at(variant)
+            episodes, seconds = play(key, search, config.episodes, bar, at)
         played = int(episodes.length.sum())
         wall, cpu = action_seconds(key, search)
         kept = jax.tree.map(lambda a: a[: config.episodes], episodes)
+        evaluate.check(kept, name)
         rows.append(
             {
                 "env": task.name,
@@ -125,17 +145,23 @@ def run(
 
 
 def main() -> None:
-    """The command line."""
-    config = tyro.cli(Config, prog="python -m experiments.mpc", description=__doc__)
+    """Exits with 2 on bad input."""
+    name, argv = "experiments.mpc", sys.argv[1:]
+    folder = cli.to_resume(argv)
     with cli.bad_input():
-        task, searches, penalty = prepare(config)
-        out = config.out or pipeline.default_out(f"mpc-{config.env}", str(config.horizon))
-        folder = storage.new_folder(out)
-    versions = {"rp_jax": rp_jax.__version__, "jax": jax.__version__}
-    settings = {**dataclasses.asdict(config), "penalty": penalty, "versions": versions}
-    storage.write_json(folder / "config.json", settings)
-    rows = run(config, task, searches, penalty)
-    tables.write(folder, rows)
+        if folder is not None:
+            config, checkpoints = cli.resumed(name, folder, Config, argv)
+            task, searches, penalty = prepare(config)
+        else:
+            config = tyro.cli(Config, prog=f"python -m {name}", description=__doc__)
+            task, searches, penalty = prepare(config)
+            out = config.out or pipeline.default_out(f"mpc-{config.env}", str(config.horizon))
+            folder = storage.new_folder(out)
+            used = {"table": penalty, "search": float(searches[0].penalty)}
+            checkpoints = begin(folder, name, dataclasses.asdict(config) | {"penalties": used})
+    with cli.resumable(name, folder, checkpoints):
+        rows = run(config, task, searches, penalty, checkpoints)
+        tables.write(folder, rows)
     for row in rows:
         cpu = row["cpu_seconds_per_100_actions"]
         many = row["seconds_per_100_actions_in_batch"]

@@ -68,7 +68,7 @@ def prepare(
 
 def run(task: tasks.Task, config: tasks.Config, folder: Path, checkpoints: Checkpoints) -> None:
     """The whole job, into a folder that has its config.json."""
-    began = time.perf_counter()
+    began, resumed = time.perf_counter(), checkpoints.begun()
     models, curves, parts = reconnaissance.learn_threats(task, config, folder, checkpoints)
     explored = time.perf_counter() - began
     pmdp, members = tasks.make_pmdp(task, config, models, task.train), tasks.members_of(config)
@@ -79,6 +79,7 @@ def run(task: tasks.Task, config: tasks.Config, folder: Path, checkpoints: Check
         "crashes": sum(row["crashes"] for row in trained.history),
         "episodes": sum(row["episodes"] for row in trained.history),
         "inadmissible": sum(row["inadmissible"] for row in trained.history),
+        "resumed": resumed,  # the seconds are then of the last process alone, but for planning
         "seconds": {
             "reconnaissance": explored,
             "reconnaissance_parts": parts,

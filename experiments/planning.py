@@ -96,7 +96,8 @@ def plan(
 
         def step(i: int, state: LoopState) -> tuple[LoopState, dict[str, Any]]:
             now = during(pmdp, i / chunks, config)
-            state, metrics = programs.chunk(state, now, length, planning.updates)
+            here = devices.returned(state, mesh)
+            state, metrics = programs.chunk(here, now, length, planning.updates)
             return state, devices.gather(metrics, mesh)._asdict()
 
         def check(params: Any, metrics: dict[str, Any]) -> None:
@@ -120,7 +121,7 @@ def plan(
             check,
             lambda state: state.learner.params,
             bar,
-            checkpoints if mesh is None else NO_CHECKPOINTS,
+            checkpoints if devices.one_process() else NO_CHECKPOINTS,
         )
         params = devices.gather(params, mesh)
     about = {"methods": methods_of(names), "members": [member._asdict() for member in members]}

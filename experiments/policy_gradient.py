@@ -16,7 +16,7 @@ from rp_jax import evaluate
 from rp_jax.baselines import actor_critic, cpo, pid_lagrangian
 from rp_jax.checkpoints import Checkpoints
 from rp_jax.planning.pmdp import PMDP
-from rp_jax.validate import finite
+from rp_jax.validate import finite, none_bad
 
 LEARNERS: Mapping[str, Any] = {"CPO": cpo, "PID-Lagrangian": pid_lagrangian}
 
@@ -42,7 +42,7 @@ def learn(
         checkpoints: of the learning.
 
     Raises:
-        FloatingPointError: something that was learned is not a finite number.
+        FloatingPointError: something that was seen or learned is not a finite number.
     """
     name, learning, limit = method
     learner, members = LEARNERS[name], tasks.members_of(config)
@@ -77,6 +77,8 @@ def learn(
 
         def step(_: int, state: Any) -> tuple[Any, dict[str, jax.Array]]:
             state, metrics = improve(state, pmdp, c)
+            counts = {key: metrics[key] for key in actor_critic.Metrics._fields}
+            none_bad(name, actor_critic.Metrics(**counts))
             # Not finite, it stops CPO without a word: no step is then accepted.
             critic = carried(state).critic
             finite(f"{name}: values' weights", jax.flatten_util.ravel_pytree(critic)[0])

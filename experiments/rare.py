@@ -7,6 +7,7 @@ python -m experiments.rare --run results/NEW --variant N=8 --out results/again \
     --starts results/rare/worst_starts   # another agent, from the worst starts of that one
 """
 
+import dataclasses
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,14 +134,27 @@ def offspring(key: jax.Array, parent: Any, fresh: Any, share: float = 0.2) -> An
     return parent.replace(obstacles=rows[0], present=rows[1])
 
 
+def distinct(starts: Any) -> Any:
+    """(m, ...) each of the starts (n, ...) once, in the order of their first appearance."""
+    rows = [np.asarray(a) for a in jax.tree.leaves(starts)]
+    flat = [np.ascontiguousarray(a.reshape(len(a), -1)).view(np.uint8) for a in rows]
+    _, first = np.unique(np.concatenate(flat, axis=1), axis=0, return_index=True)
+    kept = np.sort(first)
+    return jax.tree.map(lambda a: a[kept], starts)
+
+
 def worst_starts(key: jax.Array, subject: Subject, first: Any, config: Config) -> Any:
     """The starts (kept, ...) of most crashes: the worst tenth of each generation has offspring.
 
     Args:
         key: of the search.
         subject: the agent.
-        first: starts that have led to crashes, (n, ...); or None.
+        first: starts that have led to crashes, (n, ...), copies included; or None. Half of the
+            first generation is of them.
         config: sizes.
+
+    Returns:
+        At most `kept` different starts.
     """
     pmdp, size = subject.pmdp, config.population
     elite = max(config.kept, size // 10)
@@ -148,14 +162,17 @@ def worst_starts(key: jax.Array, subject: Subject, first: Any, config: Config) -
         lambda key: jax.vmap(pmdp.env.reset, (0, None))(jax.random.split(key, size), pmdp.params)
     )
     breed = jax.jit(jax.vmap(offspring))
-    first_key, key = jax.random.split(key)
+    first_key, mix, key = jax.random.split(key, 3)
     starts = draw(first_key)
     if first is not None:
-        n = min(size, first.time.shape[0])
-        starts = jax.tree.map(lambda a, b: jnp.concatenate([a[:n], b[n:]]), first, starts)
+        known = distinct(first)
+        picked = np.asarray(jax.random.permutation(mix, known.time.shape[0])[: size // 2])
+        rest = size - len(picked)
+        starts = jax.tree.map(lambda a, b: jnp.concatenate([a[picked], b[:rest]]), known, starts)
     with console.progress("worst starts") as bar:
         for i in range(config.generations):
             play, parent_key, fresh_key, mix_key = jax.random.split(jax.random.fold_in(key, i), 4)
+            starts = distinct(starts)
             crashes = crashes_from(play, subject, starts, config.tries)
             order = np.argsort(-crashes, kind="stable")[:elite]
             note = f"the worst {elite} crash in {100 * crashes[order].mean() / config.tries:.1f} %"
@@ -163,10 +180,12 @@ def worst_starts(key: jax.Array, subject: Subject, first: Any, config: Config) -
             best = jax.tree.map(lambda a, order=order: a[order], starts)
             if i == config.generations - 1:
                 return jax.tree.map(lambda a: a[: config.kept], best)
-            chosen = jax.random.randint(parent_key, (size - elite,), 0, elite)
+            fresh = draw(fresh_key)
+            chosen = jax.random.randint(parent_key, (size,), 0, len(order))
             parents = jax.tree.map(lambda a, chosen=chosen: a[chosen], best)
-            fresh = jax.tree.map(lambda a: a[: size - elite], draw(fresh_key))
-            children = breed(jax.random.split(mix_key, size - elite), parents, fresh)
+            children = breed(jax.random.split(mix_key, size), parents, fresh)
+            more = size - len(order)
+            children = jax.tree.map(lambda a, more=more: a[:more], children)
             starts = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), best, children)
     return jax.tree.map(lambda a: a[: config.kept], starts)
 
@@ -202,7 +221,8 @@ def run(config: Config, loaded: runs.Run, folder: Path) -> dict[str, Any]:
         show(row)
         if config.generations > 0:
             known = worst_starts(search, subject, first, config)
-            storage.save(folder / "worst_starts", STARTS, known, {**about, "count": config.kept})
+            count = known.time.shape[0]
+            storage.save(folder / "worst_starts", STARTS, known, {**about, "count": count})
     if known is not None:
         crashes = crashes_from(check, subject, known, config.checks)
         row["worst_starts"] = [
@@ -254,7 +274,13 @@ def main() -> None:
     with cli.bad_input():
         config.validate()
         loaded = runs.load(config.run)
+        about = {"variant": loaded.subject(config.variant, config.agent).variant}
+        if config.starts is not None:
+            known_starts(
+                config.starts, loaded.pmdp(about["variant"]), about | {"env": loaded.task.name}
+            )
         folder = storage.new_folder(config.out)
+        storage.write_json(folder / "config.json", dataclasses.asdict(config))
         run(config, loaded, folder)
 
 

@@ -126,6 +126,7 @@ def main() -> None:
     config = tyro.cli(Config, description=__doc__)
     with cli.bad_input():
         config.validate()
+        cli.needs_matplotlib(True)
         folder = storage.new_folder(config.out)
     rows = run(config)
     storage.write_json(folder / "sampling.json", {"settings": config.__dict__, "rows": rows})

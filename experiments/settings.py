@@ -1,8 +1,10 @@
 """config.json of a run: written at its beginning, read back to use or to resume the run."""
 
 import dataclasses
+import functools
 import hashlib
 import json
+import os
 import types
 import typing
 from collections.abc import Mapping
@@ -18,12 +20,29 @@ from rp_jax.checkpoints import Checkpoints
 
 CHECKPOINTS = "checkpoints"  # folder inside that of a run, until the run is finished
 LOCK = f"{CHECKPOINTS}/lock"  # held by the process that is at work on a run
+FLAGS = ("XLA_FLAGS", "JAX_DEFAULT_MATMUL_PRECISION", "JAX_ENABLE_X64")  # they change last bits
+DRAWN = ("all.py", "console.py", "drawing.py", "report.py")  # nothing is computed there
 
 
 def machine() -> dict[str, Any]:
     """What must not change for a run to be resumed to the same bits."""
-    versions = {"rp_jax": rp_jax.__version__, "jax": jax.__version__}
-    return {"versions": versions, "device": str(jax.devices()[0])}
+    return {
+        "versions": {"rp_jax": rp_jax.__version__, "jax": jax.__version__},
+        "device": str(jax.devices()[0]),
+        "flags": {name: os.environ.get(name, "") for name in FLAGS},
+        "code": code(),
+    }
+
+
+@functools.cache
+def code() -> str:
+    """Checksum of the source that computes a run; what only draws or reports is not in it."""
+    here, library = Path(__file__).parent, Path(rp_jax.__file__).parent
+    digest = hashlib.sha256()
+    for file in (*sorted(library.glob("**/*.py")), *sorted(here.glob("*.py"))):
+        if "plot" not in file.parts and file.name not in DRAWN:
+            digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def begin(folder: Path, experiment: str, settings: Mapping[str, Any]) -> Checkpoints:

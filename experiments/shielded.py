@@ -113,6 +113,7 @@ def played(key: jax.Array, pmdp: PMDP, weights: Any, policy: Policy, discrete: b
         t, alive, state, rows = carry
         action = policy.act(weights, state.obs, jax.random.fold_in(act_key, t))
         reached = env.step(state, action)
+        hit = jax.vmap(pmdp.env.causes, (0, None))(reached.pipeline_state, pmdp.params)
         new = evaluate.Episodes(
             score=rows.score + reached.reward,
             danger=rows.danger + reached.info["cost"],
@@ -120,7 +121,7 @@ def played(key: jax.Array, pmdp: PMDP, weights: Any, policy: Policy, discrete: b
             length=rows.length + 1,
             interventions=rows.interventions + reached.info.get("intervention", 0.0),
             insecure=rows.insecure + reached.info.get("insecure", 0.0),
-            causes=jax.vmap(pmdp.env.causes, (0, None))(reached.pipeline_state, pmdp.params),
+            causes=jax.tree.map(jnp.logical_or, rows.causes, hit),
             bad_observations=rows.bad_observations + not_finite(state.obs),
             bad_threats=rows.bad_threats,  # the shield's own
         )
@@ -159,6 +160,7 @@ def compare(config: Config, task: tasks.Task, folder: Path) -> list[dict[str, An
                 bar("", len(rows) * rounds + len(found), len(cases) * rounds, f"{name}, {shown}")
                 found.append(jax.tree.map(np.asarray, play(key, pmdp, policy.weights)))
             every = jax.tree.map(lambda *a: np.concatenate(a)[: config.episodes], *found)
+            evaluate.check(every, name)
             found_of = evaluate.summarise(every, settings.penalty)
             rows.append({"policy": name, "shield": shown, **found_of})
         bar("", len(cases) * rounds, len(cases) * rounds)

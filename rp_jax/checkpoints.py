@@ -35,6 +35,10 @@ class Checkpoints:
             return self
         return replace(self, folder=self.folder / name, name=f"{self.name} {name}".strip())
 
+    def begun(self) -> bool:
+        """Whether there is any checkpoint in the folder, or in a folder of it."""
+        return self.folder is not None and any(_by_age(p) for p in self.folder.glob("**/"))
+
     def loop(
         self,
         state: State,

@@ -101,18 +101,28 @@ def placed(shapes: Any, mesh: Mesh | None) -> Any:
     return jax.tree.map(put, shapes)
 
 
+def returned(rows: Any, mesh: Mesh | None) -> Any:
+    """Rows that were read from a file where a `spread` function leaves them; others as they are."""
+    return rows if mesh is None else jax.device_put(rows, NamedSharding(mesh, P(ROWS)))
+
+
 def gather(rows: Any, mesh: Mesh | None) -> Any:
     """All rows in the memory of every process."""
     if mesh is None:
         return rows
-    if jax.process_count() == 1:
+    if one_process():
         return jax.device_get(rows)
     return multihost_utils.process_allgather(rows, tiled=True)
 
 
 def agreed(tree: Any) -> Any:
     """The first process's values, on every process: machines may differ in the last bits."""
-    return tree if jax.process_count() == 1 else multihost_utils.broadcast_one_to_all(tree)
+    return tree if one_process() else multihost_utils.broadcast_one_to_all(tree)
+
+
+def one_process() -> bool:
+    """Whether there are no others, so that all rows are within reach."""
+    return jax.process_count() == 1
 
 
 def is_first() -> bool:

@@ -218,7 +218,7 @@ def record(
 
 
 def visited_states(key: Array, pmdp: PMDP, count: int, steps: int = 30) -> Any:
-    """States (count,) that exploring inside the admissible set comes by, 0 to `steps` steps in."""
+    """States (count,) that exploring in the admissible set comes by in fewer than `steps` steps."""
     start_key, stop_key, walk_key = jax.random.split(key, 3)
     starts = jax.vmap(pmdp.env.reset, (0, None))(jax.random.split(start_key, count), pmdp.params)
     stop = jax.random.randint(stop_key, (count,), 0, steps)

@@ -18,9 +18,11 @@ from jax import Array
 
 from rp_jax import shield
 from rp_jax.envs.base import select
-from rp_jax.planning.pmdp import PMDP, Percept
+from rp_jax.planning.pmdp import PMDP, Percept, faults
 
 Values = Callable[[Percept], Array]
+SHARE = 0.2  # of the paths, that reach one level from the one before
+MOST_LEVELS = 12
 
 
 class Paths(NamedTuple):
@@ -32,6 +34,7 @@ class Paths(NamedTuple):
     crashed: Array  # (B,) bool; there the path ends, even if the episode would go on
     reached: Array  # (B,) bool, the level of the last stage was reached, or the episode crashed
     length: Array  # (B,) int32, steps simulated in the last stage
+    bad: Array  # (B,) bool, an observation or a threat was nan or infinite on the way
 
 
 def begin(key: Array, pmdp: PMDP, count: int) -> Paths:
@@ -45,7 +48,7 @@ def from_starts(states: Any, pmdp: PMDP) -> Paths:
     count = states.time.shape[0]
     no = jnp.zeros(count, bool)
     zero = jnp.zeros(count, pmdp.x.dtype)
-    return Paths(states, states, zero, no, no, jnp.zeros(count, jnp.int32))
+    return Paths(states, states, zero, no, no, jnp.zeros(count, jnp.int32), no)
 
 
 def advance(key: Array, paths: Paths, pmdp: PMDP, values: Values, level: Array) -> Paths:
@@ -79,6 +82,8 @@ def advance(key: Array, paths: Paths, pmdp: PMDP, values: Values, level: Array) 
             crashed=paths.crashed | crashed,
             reached=paths.reached | there | crashed,
             length=paths.length + alive,
+            bad=paths.bad
+            | (alive & jnp.any(jnp.stack(faults(percept.encoded, percept.threat)), 0)),
         )
         return t + 1, alive & ~outcome.done & ~crashed, paths
 
@@ -177,8 +182,21 @@ _resample = jax.jit(resample)
 
 
 def compiled(values: Values) -> Callable[..., Paths]:
-    """(key, paths, pmdp, level) -> Paths: `advance`, compiled once for a policy."""
-    return jax.jit(lambda key, paths, pmdp, level: advance(key, paths, pmdp, values, level))
+    """(key, paths, pmdp, level) -> Paths: `advance`, compiled once for a policy.
+
+    It raises FloatingPointError if a path saw what is not a finite number.
+    """
+    stage = jax.jit(lambda key, paths, pmdp, level: advance(key, paths, pmdp, values, level))
+
+    def checked(key: Array, paths: Paths, pmdp: PMDP, level: Array) -> Paths:
+        found = stage(key, paths, pmdp, level)
+        if count := int(found.bad.sum()):
+            raise FloatingPointError(
+                f"rare: observations or threats of {count:,} paths are nan or infinite"
+            )
+        return found
+
+    return checked
 
 
 def choose_levels(
@@ -186,10 +204,8 @@ def choose_levels(
     pmdp: PMDP,
     particles: int,
     stage: Callable[..., Paths],
-    share: float = 0.2,
-    most: int = 12,
 ) -> tuple[list[float], int]:
-    """Levels that about a `share` of the paths reach from one to the next, found by a pilot run.
+    """Levels that about a fifth of the paths reach from one to the next, found by a pilot run.
 
     Use them with other keys: an estimate whose levels come from its own paths is biased.
 
@@ -200,12 +216,12 @@ def choose_levels(
     steps = 0
     start_key, key = jax.random.split(key)
     paths = _begin(start_key, pmdp, particles)
-    for i in range(most):
+    for i in range(MOST_LEVELS):
         look, play, pick = jax.random.split(jax.random.fold_in(key, i), 3)
         seen = stage(look, paths, pmdp, jnp.asarray(np.inf, pmdp.x.dtype))
         steps += int(seen.length.sum())
         highest = np.where(np.asarray(seen.crashed), np.inf, np.asarray(seen.highest))
-        level = float(np.quantile(highest, 1 - share, method="lower"))
+        level = float(np.quantile(highest, 1 - SHARE, method="lower"))
         if not (levels[-1] if levels else 0.0) < level < np.inf:
             break
         levels.append(level)

@@ -5,6 +5,9 @@ from contextlib import contextmanager
 import jax
 import pytest
 
+from rp_jax import checkpoints
+from rp_jax.checkpoints import Checkpoints
+
 
 @contextmanager
 def unoptimised():
@@ -20,4 +23,21 @@ def unoptimised():
 def compile_soon():
     """For all tests of a module that imports this."""
     with unoptimised():
+        yield
+
+
+@contextmanager
+def stopped_after(steps, monkeypatch):
+    """In here a loop with checkpoints, one for each step, is interrupted after so many."""
+    save = Checkpoints._save
+
+    def stop(self, done, *rest):
+        save(self, done, *rest)
+        if done == steps:
+            raise KeyboardInterrupt(f"{done} done")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoints, "INTERVAL", 0.0)
+        patch.setattr(checkpoints, "SHARE", float("inf"))
+        patch.setattr(Checkpoints, "_save", stop)
         yield

@@ -3,15 +3,21 @@
 python tests/spreading.py SETTING prints what is equal, as JSON; started by test_devices.py.
 """
 
+import contextlib
+import dataclasses
 import json
 import sys
+import tempfile
+from pathlib import Path
 
+import forked
 import jax
 import jax.numpy as jnp
 import numpy as np
 import probe
 
-from rp_jax import devices
+from experiments import planning, tasks
+from rp_jax import checkpoints, devices
 from rp_jax.planning import loop
 from rp_jax.recon import labels, sampling
 
@@ -45,6 +51,34 @@ def labelled(mesh):
     return jax.device_get(labels.label(jax.random.key(2), *start, sub, estimator, mesh=mesh))
 
 
+def resumed(folder):
+    """Weights of a run that was interrupted half-way and resumed, and of one that was not."""
+    presets, make_task = forked.corridor()
+    config = dataclasses.replace(presets["quick"]("tuned"), devices="all", seeds=SEEDS)
+    task = make_task(config)
+    pmdp = tasks.make_pmdp(task, config, None, task.train)
+    members = tasks.members_of(config)
+    checkpoints.INTERVAL, checkpoints.SHARE = 0.0, float("inf")
+    whole, check, calls = planning.loop.check, planning.loop.check, []
+
+    def interrupted(*arguments):
+        calls.append(None)
+        if len(calls) == 12:
+            raise KeyboardInterrupt
+        check(*arguments)
+
+    found = []
+    for name, checks in {"apart": (interrupted, whole), "at_once": (whole,)}.items():
+        (folder / name).mkdir()
+        kept = checkpoints.Checkpoints(folder / name / "checkpoints", run="a")
+        for planning.loop.check in checks:
+            with contextlib.suppress(KeyboardInterrupt):
+                trained = planning.plan(config, pmdp, members, folder / name, kept.at("planning"))
+        found.append(trained.params)
+    assert len(calls) == 12
+    return found
+
+
 def equal(a, b):
     """Whether all bits of two pytrees are."""
     return all(jax.tree.leaves(jax.tree.map(np.array_equal, a, b)))
@@ -64,6 +98,7 @@ def main(setting):
         "processes": jax.process_count(),
         "same_seeds": equal(spread, apart),
         "same_labels": equal(labelled(mesh), labelled(None)),
+        "same_resumed": jax.process_count() > 1 or equal(*resumed(Path(tempfile.mkdtemp()))),
         "sum": float(sum(np.abs(a).sum() for a in jax.tree.leaves(spread))),
     }
     print(json.dumps(found))

@@ -15,7 +15,12 @@ ROOT = Path(__file__).parents[1]
 
 
 def start(setting, **environment):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu", **environment}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": f"{ROOT}:{ROOT / 'tests' / 'experiments'}",
+        "JAX_PLATFORMS": "cpu",
+        **environment,
+    }
     script = str(ROOT / "tests" / "spreading.py")
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen([sys.executable, script, setting], env=environment, **pipes)
@@ -30,6 +35,7 @@ def finish(process):
 def same_as_one_device(found):
     assert found["same_seeds"]  # to the last bit, in programs of as many seeds
     assert found["same_labels"]
+    assert found["same_resumed"]
 
 
 def test_four_devices_do_what_one_does():

@@ -12,14 +12,15 @@ import pytest
 from quick import compile_soon  # noqa: F401
 
 from experiments import policy_gradient, tasks
-from rp_jax import evaluate, shield
+from rp_jax import evaluate, rare, shield
+from rp_jax.baselines import actor_critic
 from rp_jax.baselines.actor_critic import ActorCriticConfig
 from rp_jax.baselines.cpo import CPOConfig
 from rp_jax.baselines.pid_lagrangian import PIDConfig
 from rp_jax.checkpoints import NO_CHECKPOINTS
 from rp_jax.planning import dqn, loop
 from rp_jax.planning.loop import LoopConfig
-from rp_jax.planning.pmdp import encode
+from rp_jax.planning.pmdp import PMDP, encode
 from rp_jax.recon import labels
 from rp_jax.threat import build
 from rp_jax.threat.fit import Dataset, FitConfig
@@ -93,9 +94,8 @@ def test_observations_are_named(wrong, place):
     pmdp = probe.make_pmdp(seen_with(wrong, place), PARAMS)
     with pytest.raises(FloatingPointError, match=r"^N=8: observations of \d+ steps are nan"):
         played(pmdp)
-    if place == 7:
-        with pytest.raises(FloatingPointError, match=r"^planning: observations of \d+ steps"):
-            trained(pmdp)
+    with pytest.raises(FloatingPointError, match=r"^planning: observations of \d+ steps"):
+        trained(pmdp)
 
 
 @pytest.mark.parametrize("wrong", WRONG)
@@ -105,7 +105,31 @@ def test_a_lidar_that_is_no_number_is_not_hidden_in_bytes(wrong):
     assert np.isfinite(encode(jnp.asarray([0.5, 0.5, 0.5, 0.5, 7.0]), 4, 2).rest).all()
 
 
-def test_threats_are_named():
+class Threatened(PMDP):
+    """One state's threats hold a number that is none, whatever they come from."""
+
+    def threat(self, states, alive=None):
+        there = (states.time == 2)[:, None] & (jnp.arange(3) == 1)
+        wrong = self.toll  # which serves for nothing else here
+        return jnp.where(there, wrong, jnp.zeros((states.time.shape[0], 3)))
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_threats_are_named(wrong):
+    like = probe.make_pmdp(probe, PARAMS)
+    fields = {name: getattr(like, name) for name in like.__dataclass_fields__}
+    pmdp = Threatened(**{**fields, "toll": jnp.float32(wrong)})
+    with pytest.raises(FloatingPointError, match=r"^planning: threats of \d+ steps"):
+        trained(pmdp)
+    with pytest.raises(FloatingPointError, match=r"^N=8: threats of \d+ steps"):
+        played(pmdp)
+    values = lambda percept: jnp.zeros(percept.threat.shape)  # noqa: E731
+    stage, paths = rare.compiled(values), rare.begin(jax.random.key(0), pmdp, 8)
+    with pytest.raises(FloatingPointError, match=r"^rare: observations or threats of \d paths"):
+        stage(jax.random.key(1), paths, pmdp, jnp.float32(np.inf))
+
+
+def test_threats_of_a_model_are_named():
     pmdp = probe.make_pmdp(probe, PARAMS, models=model_with(np.nan))
     with pytest.raises(FloatingPointError, match=r"^planning: threats of \d+ steps"):
         trained(pmdp)
@@ -145,7 +169,7 @@ def test_losses_are_named(wrong, monkeypatch):
         trained(probe.make_pmdp(probe, PARAMS))
 
 
-def faulty(wrong):
+def faulty(wrong, adam=optax.adam(1e-3)):  # noqa: B008
     """An optimiser that meets a gradient that is no number."""
 
     def update(grads, state, params=None):
@@ -153,7 +177,6 @@ def faulty(wrong):
         broken = [first.at[(0,) * first.ndim].set(wrong), *rest]
         return adam.update(jax.tree.unflatten(jax.tree.structure(grads), broken), state, params)
 
-    adam = optax.adam(1e-3)
     return optax.GradientTransformation(adam.init, update)
 
 
@@ -172,8 +195,26 @@ def test_policy_gradients_stop_at_rewards_that_are_none(name, tmp_path):
     learning = {"CPO": CPOConfig(rollout), "PID-Lagrangian": PIDConfig(rollout)}[name]
     method, pmdp = policy_gradient.Method(name, learning, 0.1), probe.make_pmdp(env, PARAMS)
     config = tasks.Config(planning=dataclasses.replace(CONFIG, steps=256))
-    with pytest.raises(FloatingPointError, match=f"^{name}: values' weights"):
+    with pytest.raises(FloatingPointError, match=rf"^{name}: rewards of \d+ steps are nan"):
         policy_gradient.learn(method, pmdp, config, tmp_path / "it", NO_CHECKPOINTS)
+
+
+@pytest.mark.parametrize("name", policy_gradient.LEARNERS)
+def test_policy_gradients_name_observations_and_what_is_learned(name, tmp_path, monkeypatch):
+    rollout = ActorCriticConfig("categorical", 8, 16, minibatches=2)
+    learning = {"CPO": CPOConfig(rollout), "PID-Lagrangian": PIDConfig(rollout)}[name]
+    method = policy_gradient.Method(name, learning, 0.1)
+    config = tasks.Config(planning=dataclasses.replace(CONFIG, steps=256))
+
+    def learns(env, folder):
+        pmdp = probe.make_pmdp(env, PARAMS)
+        policy_gradient.learn(method, pmdp, config, tmp_path / folder, NO_CHECKPOINTS)
+
+    with pytest.raises(FloatingPointError, match=rf"^{name}: observations of \d+ steps are nan"):
+        learns(seen_with(np.inf, 17), "seen")
+    monkeypatch.setattr(actor_critic.optax, "adam", lambda *_, **__: faulty(np.nan))
+    with pytest.raises(FloatingPointError, match=f"^{name}: values' weights"):
+        learns(probe, "learned")
 
 
 @pytest.mark.parametrize("wrong", WRONG[:2])

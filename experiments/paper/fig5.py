@@ -100,32 +100,35 @@ def rise(env: str, of: dict[str, Any]) -> list[dict[str, Any]]:
         rows = [row for row in of["history"] if row["method"] == method and row["episodes"]]
         steps = sorted({row["steps"] for row in rows})
         count = max(1, round(TENTH * len(steps)))
-        late, before = (
-            _by_seed([row for row in rows if row["steps"] in tenth])
-            for tenth in (steps[-count:], steps[-2 * count : -count])
-        )
-        change, width = statistics.mean_interval(late - before)
+        tenths = (steps[-count:], steps[-2 * count : -count])
+        late, before = (_by_seed([r for r in rows if r["steps"] in tenth]) for tenth in tenths)
+        both = sorted(late.keys() & before.keys())
+        if not both:  # no episode ended in one of the two
+            continue
+        last = float(np.mean([late[seed] for seed in both]))
+        changes = np.asarray([late[seed] - before[seed] for seed in both])
+        change, width = statistics.mean_interval(changes)
         lines.append(
             {
                 "task": env,
                 "method": method,
                 "steps": f"{steps[-1]:,}",
-                "last tenth": f"{late.mean():.2f}",
+                "last tenth": f"{last:.2f}",
                 "change from the tenth before": f"{change:+.2f} +- {width:.2f}",
-                "of the return, %": f"{100 * change / abs(late.mean()):+.1f}",
+                "of the return, %": f"{100 * change / abs(last):+.1f}",
             }
         )
     return lines
 
 
-def _by_seed(rows: list[dict[str, Any]]) -> np.ndarray:
-    """(seeds,) mean returns of the episodes of some chunks."""
-    found = []
-    for seed in sorted({row["seed"] for row in rows}):
+def _by_seed(rows: list[dict[str, Any]]) -> dict[int, float]:
+    """Mean returns of the episodes of some chunks, by seed."""
+    found = {}
+    for seed in {row["seed"] for row in rows}:
         of = [row for row in rows if row["seed"] == seed]
         weights = [row["episodes"] for row in of]
-        found.append(np.average([row["return_mean"] for row in of], weights=weights))
-    return np.asarray(found)
+        found[seed] = float(np.average([row["return_mean"] for row in of], weights=weights))
+    return found
 
 
 def _by_step(history: list[dict], method: str) -> list[tuple[int, float, float]]:

@@ -54,6 +54,9 @@ class Sources:
                 other, _, file = word[1:].partition("/")
                 rest[i] = str(self(other) / file)
         log = read(folder / LOG) if (folder / LOG).exists() else []
+        if resumable(folder) and not of_this_code(folder):
+            console.say(f"{folder}: it was begun by other code, and begins anew", style="yellow")
+            shutil.rmtree(folder)
         if resumable(folder):
             rest = ["--resume", str(folder)]
         else:
@@ -101,6 +104,12 @@ def finished(folder: Path) -> bool:
 def resumable(folder: Path) -> bool:
     """There is a run in the folder that `--resume` goes on with."""
     return _begun(folder) and (folder / settings.CHECKPOINTS).is_dir()
+
+
+def of_this_code(folder: Path) -> bool:
+    """The run in the folder was begun by what would go on with it, on a machine like this."""
+    found = settings.read(folder)
+    return all(found.get(name) == here for name, here in settings.machine().items())
 
 
 def _begun(folder: Path) -> bool:

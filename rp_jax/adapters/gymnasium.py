@@ -243,9 +243,19 @@ class Shielded(gymnasium.Wrapper):
             action: an integer, whose substitute is the least threatening action; or (A,) floats,
                 the policy's scores, whose substitute is its next best; or with a table (D,)
                 floats, taken for the nearest row, whose substitute is the nearest admissible one.
+
+        Raises:
+            FloatingPointError: all threats are nan, or a number of the action is.
         """
         state = self._seen if self._find is None else self._find(self.env.unwrapped)
-        chosen = self._correct(jnp.asarray(self._threat(state)), jnp.asarray(action))
+        threat, wish = np.asarray(self._threat(state)), np.asarray(action)
+        if np.isnan(threat).all():
+            raise FloatingPointError(f"threat: all {threat.size} numbers are nan")
+        if wish.dtype.kind == "f" and np.isnan(wish).any():
+            raise FloatingPointError(
+                f"action: {np.isnan(wish).sum()} of {wish.size} numbers are nan"
+            )
+        chosen = self._correct(jnp.asarray(threat), jnp.asarray(wish))
         row = int(chosen.action)
         taken = row if self._table is None else self._table[row]
         self._seen, reward, terminated, truncated, info = self.env.step(taken)

@@ -17,7 +17,7 @@ from jax import Array
 
 from rp_jax.baselines.policies import ACTORS, Critic
 from rp_jax.envs import base
-from rp_jax.planning.pmdp import PMDP, Encoded, Percept
+from rp_jax.planning.pmdp import PMDP, Encoded, Percept, faults, not_finite
 from rp_jax.validate import number, one_of
 
 REWARD, DANGER = range(2)  # places of the two signals
@@ -116,6 +116,8 @@ class Metrics(NamedTuple):
     danger: Array  # likewise
     crashes: Array  # finished episodes with any danger
     goals: Array
+    bad_observations: Array  # states seen with a number that is nan or infinite
+    bad_rewards: Array  # steps, likewise of the reward or the danger
 
 
 class _Step(NamedTuple):
@@ -258,6 +260,8 @@ def collect(
             danger=jnp.sum(jnp.where(outcome.done, danger, 0.0)),
             crashes=jnp.sum(outcome.done & (danger > 0), dtype=score.dtype),
             goals=jnp.sum(outcome.goal, dtype=score.dtype),
+            bad_observations=jnp.sum(faults(encoded, signal)[0], dtype=score.dtype),
+            bad_rewards=jnp.sum(not_finite(signal), dtype=score.dtype),
         )
         running = [jnp.where(outcome.done, 0.0, total) for total in (score, danger, earned)]
         return (*carried, *running), (step, metrics, jnp.sum(jnp.square(earned)))

@@ -140,7 +140,7 @@ def step_and_renew(
         env: the environment.
         keys: (B,) one per row; no row depends on another.
         states: leading axis (B,).
-        actions: (B,) int.
+        actions: (B,) int, or (B, 2) where they are continuous.
         params: of the environment, unbatched.
         look: maps a batch of states, of any size, to a pytree of rows.
 

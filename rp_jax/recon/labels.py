@@ -1,6 +1,6 @@
 """Threats of one state in a sub-R-MDP: T_n(s, a) of equation 3, for all actions at once.
 
-Both estimators take any start state and return the same thing. The danger is the event's first
+All estimators take any start state and return the same thing. The danger is the event's first
 occurrence: T_n(s, a) = E[beta^K 1{K <= horizon}], K the first step at which hazard n is hit (0 if
 it is hit already), under the action a first and the baseline policy eta^(o) after it.
 """
@@ -247,7 +247,7 @@ def label(
         agent: (n, ...) agent states.
         hazard: (n, ...) hazard states.
         sub: the sub-R-MDP.
-        estimator: `exact_threat` or a `monte_carlo_threat`.
+        estimator: `exact_threat`, `plan_threat` or a `monte_carlo_threat`; see `best_estimator`.
         batch: rows simulated at once; bounds the memory.
         rows: rows between two reports of progress.
         on_progress: called with (rows done, n).

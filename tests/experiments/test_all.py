@@ -42,7 +42,7 @@ class Runs:
         self.stops.discard(folder.name)
         status = 130 if stops else self.exits.get(folder.name, 0)
         if status != 2:  # which is bad input, before anything is written
-            storage.write_json(folder / "config.json", {"experiment": "it"})
+            storage.write_json(folder / "config.json", {"experiment": "it"} | settings.machine())
         checkpoints = folder / settings.CHECKPOINTS
         if stops:
             checkpoints.mkdir()
@@ -78,6 +78,15 @@ def test_an_interrupted_run_stops_everything_and_is_resumed(runs, tmp_path):
     module.Sources(tmp_path, "quick")("jam")
     assert runs.commands[1] == f"python -m experiments.jam --resume {tmp_path}/jam"
     assert len(json.loads((tmp_path / "jam" / module.LOG).read_text())) == 2
+
+
+def test_an_interrupted_run_of_other_code_begins_anew(runs, tmp_path, monkeypatch):
+    runs.stops.add("jam")
+    with pytest.raises(KeyboardInterrupt):
+        module.Sources(tmp_path, "quick")("jam")
+    monkeypatch.setattr(settings, "code", lambda: "other")
+    module.Sources(tmp_path, "quick")("jam")
+    assert "--resume" not in runs.commands[1]
 
 
 def test_a_failed_run_is_not_tried_twice_and_begins_anew_later(runs, tmp_path):
@@ -180,6 +189,21 @@ def test_one_failure_is_named_and_stops_no_other(runs, tmp_path, monkeypatch, ca
     assert (out / "first" / "one.png").exists()
     assert "3 verdicts" in (out / "REPORT.md").read_text()
     assert len(runs.commands) == 1
+
+
+def test_what_cannot_be_told_is_among_the_failures_and_hides_nothing(runs, tmp_path, monkeypatch):
+    names = {name: stub({"value": 1}, ["one.png"]) for name in ("first", "second", "third")}
+    monkeypatch.setattr(everything, "RESULTS", names)
+    out = tmp_path / "paper"
+    everything.main(["--out", str(out)])
+    (out / "first" / "one.png").unlink()  # as another process leaves it before it has drawn
+    storage.write_json(out / "second" / "results.json", {})  # as earlier code left it
+    failed = {}
+    shown = str(everything.blocks(out, "quick", failed))
+    assert set(failed) == {"first", "second"}
+    assert "first: FileNotFoundError" in shown
+    assert "second: KeyError: 'value'" in shown
+    assert "third/one.png" in shown
 
 
 def check_page(text, pictures):

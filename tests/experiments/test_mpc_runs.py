@@ -5,7 +5,7 @@ import sys
 
 import jax.numpy as jnp
 import pytest
-from quick import compile_soon  # noqa: F401
+from quick import compile_soon, stopped_after  # noqa: F401
 
 from experiments import mpc
 
@@ -24,10 +24,31 @@ def test_the_command_writes_a_table(tmp_path, monkeypatch, capsys):
     assert (row["variant"], row["method"], row["episodes"]) == ("N=3", "MPC (1 steps)", 3)
     assert row["seconds_per_100_actions_in_batch"] > 0
     assert row["cpu_seconds_per_100_actions"] > 0
-    assert json.loads((out / "config.json").read_text())["penalty"] == 50
+    penalties = json.loads((out / "config.json").read_text())["penalties"]
+    assert penalties == {"table": 50, "search": 50}
     assert "CPU seconds one after another" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):
         command(monkeypatch, *words, "--out", str(out))  # the folder exists
+
+
+def test_an_interrupted_search_goes_on_to_the_same_table(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(mpc, "GROUP", 2)
+    words = ["--env", "jam", "--horizon", "1", "--episodes", "6", "--variants", "N=3"]
+    command(monkeypatch, *words, "--out", str(tmp_path / "at_once"))
+    folder = tmp_path / "run"
+    with stopped_after(2, monkeypatch), pytest.raises(SystemExit, match="130"):
+        command(monkeypatch, *words, "--out", str(folder))
+    assert f"--resume {folder}" in capsys.readouterr().out
+    command(monkeypatch, "--resume", str(folder))
+    assert "N=3: 2 of 3 were done" in capsys.readouterr().out
+    tables = [
+        json.loads((out / "table.json").read_text()) for out in (folder, tmp_path / "at_once")
+    ]
+    (one,), (other,) = (
+        [{k: v for k, v in r.items() if "second" not in k} for r in t] for t in tables
+    )
+    assert one == other
+    assert not (folder / "checkpoints").exists()
 
 
 @pytest.mark.parametrize(

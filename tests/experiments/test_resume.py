@@ -10,6 +10,7 @@ from tiny import programs_of_a_moment  # noqa: F401
 
 from experiments import cli, settings
 from rp_jax import checkpoints, evaluate, storage
+from rp_jax.checkpoints import NO_CHECKPOINTS
 
 
 def call(*argv, name="killed"):
@@ -48,11 +49,26 @@ def test_what_is_no_interrupted_run_is_refused(begun, capsys, tmp_path):
     refused(capsys, "there are no checkpoints: it is finished", "--resume", begun)
 
 
-@pytest.mark.parametrize("change", [{"versions": {"jax": "0.1"}}, {"device": "TPU_0"}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"versions": {"jax": "0.1"}},
+        {"device": "TPU_0"},
+        {"code": "0123"},
+        {"flags": {"XLA_FLAGS": "--xla_cpu_enable_fast_math=true"}},
+    ],
+)
 def test_a_run_begun_elsewhere_is_refused(change, begun, capsys):
     path = begun / "config.json"
     storage.write_json(path, {**json.loads(path.read_text()), **change})
     refused(capsys, f"its {next(iter(change))} is", "--resume", begun)
+
+
+def test_a_disk_that_is_full_when_figures_are_drawn_is_told(begun, capsys):
+    with pytest.raises(SystemExit, match="1"), cli.resumable("killed", begun, NO_CHECKPOINTS):
+        raise OSError(28, "No space left on device")
+    said = " ".join(capsys.readouterr().out.split())
+    assert "error: [Errno 28] No space left on device; to go on: python -m killed" in said
 
 
 def test_a_run_of_another_experiment_is_refused(begun, capsys):

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 import sys
+import types
 from pathlib import Path
 
 import jax
@@ -194,6 +195,35 @@ def test_the_agent_that_comes_with_the_project_still_survives_its_worst_starts(t
     assert episodes == 40 * len(before)
     k, n = before.sum(axis=0)
     assert crashes <= stats.binom.ppf(0.9999, episodes, statistics.upper_bound(k, n))
+
+
+def test_the_search_for_worst_starts_descends_from_many_and_keeps_none_twice():
+    params = jam.jam.make_params(3)
+    keys = jax.random.split(jax.random.key(0), 6)
+    starts = jax.vmap(jam.jam.reset, (0, None))(keys, params)
+    often = np.asarray([4, 0, 4, 1, 1, 5])
+    once = rare.distinct(jax.tree.map(lambda a: a[often], starts))
+    first = jax.tree.map(lambda a: a[np.asarray([4, 0, 1, 5])], starts)
+    jax.tree.map(np.testing.assert_array_equal, once, first)
+
+    played = []
+
+    def stage(key, paths, pmdp, level):
+        played.append(paths.states)
+        return paths._replace(crashed=paths.states.agent.position[:, 0] > 0)
+
+    pmdp = types.SimpleNamespace(env=jam.jam, params=params, x=np.float32(0))
+    subject = rare.Subject(pmdp, None, stage)
+    sizes = {"generations": 2, "population": 10, "tries": 1, "kept": 3}
+    config = rare.Config(run=Path(), out=Path(), **sizes)
+    known = jax.tree.map(lambda a: jax.numpy.repeat(a[:2], 50, axis=0), starts)
+    found = rare.worst_starts(jax.random.key(1), subject, known, config)
+    assert found.time.shape == (3,)
+    assert rare.distinct(found).time.shape == (3,)
+    begun = np.asarray(played[0].obstacles.position)
+    for start in np.asarray(starts.obstacles.position[:2]):  # both, and fresh ones beside them
+        assert (begun == start).all(axis=(1, 2)).sum() == 1
+    assert len(begun) == 10
 
 
 def test_offspring_differ_from_their_parent_in_some_obstacles():

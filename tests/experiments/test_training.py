@@ -2,11 +2,18 @@
 
 import json
 
+import jax
 import numpy as np
+import probe
 import pytest
+from quick import compile_soon, stopped_after  # noqa: F401
 
-from experiments import console, training
+from experiments import console, policy_gradient, tasks, training
+from rp_jax.baselines.actor_critic import ActorCriticConfig
+from rp_jax.baselines.cpo import CPOConfig
+from rp_jax.baselines.pid_lagrangian import PIDConfig
 from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
+from rp_jax.planning.loop import LoopConfig
 
 COUNTED = ("steps", "episodes", "score", "danger", "crashes", "goals")
 
@@ -67,3 +74,27 @@ def test_what_is_no_number_stops_it_and_it_goes_on_from_there(tmp_path, monkeypa
     weights, rows, _ = learn(tmp_path, checkpoints)
     assert (weights, len(rows)) == (4, 8)
     assert rows[-1]["steps"] == 24
+
+
+@pytest.mark.parametrize("name", policy_gradient.LEARNERS)
+def test_an_interrupted_policy_gradient_goes_on_to_the_same_bits(name, tmp_path, monkeypatch):
+    rollout = ActorCriticConfig("categorical", 8, 16, minibatches=2)
+    learning = {"CPO": CPOConfig(rollout), "PID-Lagrangian": PIDConfig(rollout)}[name]
+    method = policy_gradient.Method(name, learning, 0.1)
+    planning = LoopConfig(steps=8 * 128, num_envs=8, batch=8, replay=64, replay_start=8)
+    pmdp, config = probe.make_pmdp(probe, probe.make_params()), tasks.Config(2, planning=planning)
+
+    def learn(folder):
+        kept = Checkpoints(folder / "checkpoints", run="one")
+        folder.mkdir(exist_ok=True)
+        agents = policy_gradient.learn(method, pmdp, config, folder, kept.at("planning"))
+        lines = (folder / "metrics.jsonl").read_text().splitlines()
+        untimed = [{k: v for k, v in json.loads(x).items() if k != "seconds"} for x in lines]
+        return agents.trained.params, untimed
+
+    with stopped_after(3, monkeypatch), pytest.raises(KeyboardInterrupt):
+        learn(tmp_path / "apart")
+    assert any((tmp_path / "apart" / "checkpoints" / "planning").iterdir())
+    apart, at_once = learn(tmp_path / "apart"), learn(tmp_path / "at_once")
+    jax.tree.map(np.testing.assert_array_equal, apart[0], at_once[0])
+    assert apart[1] == at_once[1]
