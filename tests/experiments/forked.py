@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 THREADS = Path("/proc/self/task")  # where the system has it
-TIMES = {"seconds", "seconds_per_100_actions", "train_seconds"}
+TIMES = {"seconds", "seconds_per_100_actions", "train_seconds", "resumed"}
 LOOPS = ("threat pit labels", "threat pit fit", "threat pit report", "sums pit", "planning")
 LOOPS += ("evaluation",)
 OPERATIONS = ("fsync", "replace", "unlink", "rmdir", "chmod", "mkdir")
