@@ -371,6 +371,58 @@ def test_whatever_call_fails_the_old_one_or_the_new_one_is_whole(name, tmp_path,
     assert n > 1
 
 
+@pytest.mark.parametrize("call", ["write", "flush"])
+def test_a_disk_that_fills_up_while_a_file_is_written_leaves_the_old_one(
+    call, tmp_path, monkeypatch
+):
+    """Where a full disk shows most often: half of the bytes are there."""
+    folder, opened, fdopen = tmp_path / "thing", 0, os.fdopen
+    saved_small(folder)
+
+    def half(*args, **kwargs):
+        nonlocal opened
+        opened += 1
+        file = fdopen(*args, **kwargs)
+        return Full(file, call) if opened == filled else file
+
+    for filled in (1, 2):  # the arrays, the manifest
+        opened = 0
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fdopen", half)
+            with pytest.raises(StorageError, match="No space left on device"):
+                storage.save(folder, "thing", {"a": jnp.zeros(9)}, {})
+        assert opened == filled
+        assert damaged_or_right(folder)
+        assert not list(folder.glob(".*"))
+
+
+class Full:
+    """A file on a full disk."""
+
+    def __init__(self, file, call):
+        self.file, self.call = file, call
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.file.close()
+
+    def __getattr__(self, name):
+        return getattr(self.file, name)
+
+    def write(self, data):
+        if self.call == "write":
+            self.file.write(bytes(data)[: len(data) // 2])
+            fail()
+        return self.file.write(data)
+
+    def flush(self):
+        if self.call == "flush":
+            fail()
+        self.file.flush()
+
+
 def fails_at(n, operation):
     count = 0
 

@@ -303,3 +303,19 @@ def test_stable_baselines_learns_from_it():
     )
     assert learner.learn(400).num_timesteps == 400
     assert len(learner.ep_info_buffer) >= 400 // 12
+
+
+@pytest.mark.parametrize("wish", [0, np.zeros(4, np.float32)])
+def test_threats_that_are_all_nan_stop_a_shield(wish):
+    lake = gymnasium.make("FrozenLake-v1", is_slippery=False)
+    env = adapter.Shielded(lake, lambda _: np.full(4, np.nan), 0.1)
+    env.reset(seed=0)
+    with pytest.raises(FloatingPointError, match=r"^threat: all 4 numbers are nan"):
+        env.step(wish)
+
+
+def test_scores_that_are_nan_stop_a_shield():
+    env = adapter.Shielded(gymnasium.make("FrozenLake-v1"), lambda _: np.zeros(4), 0.1)
+    env.reset(seed=0)
+    with pytest.raises(FloatingPointError, match=r"^action: 1 of 4 numbers are nan"):
+        env.step(np.asarray([0.0, np.nan, 1.0, 0.0], np.float32))
