@@ -1,7 +1,6 @@
 """All benchmarks, one after another."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 from benchmarks import adapters, env_step, recon, seeds, tabular, threat_query, train_step
 from benchmarks.measure import Row
@@ -18,4 +17,4 @@ BENCHMARKS: dict[str, Callable[[], list[Row]]] = {
 }
 
 if __name__ == "__main__":
-    command_line("python -m benchmarks", BENCHMARKS, Path("results/benchmarks"))
+    command_line("python -m benchmarks", BENCHMARKS)

@@ -18,6 +18,8 @@ from experiments import console
 from rp_jax import storage
 from rp_jax.validate import number
 
+OUT = Path("results/benchmarks")
+
 
 def machine() -> dict[str, Any]:
     """What was measured on, and with what."""
@@ -89,11 +91,11 @@ def _print(name: str, rows: Sequence[Row], before: Mapping[Key, float]) -> None:
 def report(
     name: str,
     rows: Sequence[Row],
-    out: Path | None,
+    out: Path,
     before: Mapping[Key, float] | None = None,
     processes: int = 1,
 ) -> None:
-    """Prints the rows, and writes them as JSON if `out` is given.
+    """Prints the rows, and writes them as JSON.
 
     Args:
         name: of the benchmark, and of the file.
@@ -103,24 +105,20 @@ def report(
         processes: that the rows are medians of.
     """
     _print(name, rows, before or {})
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        found = {"machine": machine(), "processes": processes, "rows": [asdict(r) for r in rows]}
-        storage.write_json(out / f"{name}.json", found)
+    out.mkdir(parents=True, exist_ok=True)
+    found = {"machine": machine(), "processes": processes, "rows": [asdict(r) for r in rows]}
+    storage.write_json(out / f"{name}.json", found)
 
 
-def command_line(
-    program: str, benchmarks: Mapping[str, Callable[[], list[Row]]], out: Path | None
-) -> None:
+def command_line(program: str, benchmarks: Mapping[str, Callable[[], list[Row]]]) -> None:
     """Runs and reports benchmarks, by name; all that was given is read before.
 
     Args:
         program: as it is called.
         benchmarks: by name.
-        out: default folder for the JSON.
     """
     parser = argparse.ArgumentParser(prog=program)
-    parser.add_argument("--out", type=Path, default=out, help="folder for the JSON")
+    parser.add_argument("--out", type=Path, default=OUT, help=f"folder for the JSON ({OUT})")
     parser.add_argument(
         "--against", type=Path, help="JSON of an earlier run, or a folder of them, to compare with"
     )
@@ -142,4 +140,4 @@ def command_line(
 
 def main(name: str, run: Callable[[], list[Row]]) -> None:
     """The command line of one benchmark."""
-    command_line(f"python -m benchmarks.{name}", {name: run}, None)
+    command_line(f"python -m benchmarks.{name}", {name: run})

@@ -158,6 +158,7 @@ def test_each_process_is_a_new_one():
 
 
 def test_rows_are_compared_with_an_earlier_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
     report.report("some", [ROW], tmp_path)
     faster = dataclasses.replace(ROW, per_second=5.0)
     new = dataclasses.replace(ROW, batch=8)
@@ -226,17 +227,15 @@ def test_rows_are_shown_and_written(tmp_path, capsys):
     assert found["machine"]["cores"] >= 1
 
 
-def test_without_a_folder_nothing_is_written(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    report.report("some", [ROW], None)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_each_benchmark_has_a_command_line_that_is_read_first(tmp_path, monkeypatch):
     out = tmp_path / "results"
     monkeypatch.setattr("sys.argv", ["benchmarks.some", "--out", str(out), *HERE])
     report.main("some", lambda: [ROW])
     assert [path.name for path in out.iterdir()] == ["some.json"]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["benchmarks.some", *HERE])
+    report.main("some", lambda: [ROW])
+    assert (tmp_path / "results" / "benchmarks" / "some.json").exists()
     monkeypatch.setattr("sys.argv", ["benchmarks.some", "--help"])
     with pytest.raises(SystemExit) as stop:
         report.main("some", lambda: pytest.fail("nothing is to be run"))

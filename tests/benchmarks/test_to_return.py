@@ -1,0 +1,57 @@
+import json
+import sys
+
+import pytest
+
+from benchmarks import to_return
+from experiments.training import Trained
+
+ROW = {
+    "variant": "default",
+    "crash_ci95": [0.0, 0.1],
+    "return_ci95": 1.0,
+    "episodes": 50,
+}
+
+
+def test_the_first_budget_with_which_all_seeds_pass_is_named(tmp_path, monkeypatch, capsys):
+    earned = {(1000, 0): (1440, 0), (1000, 1): (1400, 0)}
+    earned |= {(2000, 0): (1440, 1), (2000, 1): (1450, 0)}
+    earned |= {(4000, 0): (1440, 0), (4000, 1): (1441, 0)}
+
+    def learn(task, config, pmdp, members, folder):
+        assert list(task.tests) == ["default"]
+        assert config.threat is None
+        score, crashes = earned[config.planning.steps, config.seed]
+        row = ROW | {"return_mean": score, "crashes": crashes, "seed": config.seed}
+        return Trained(None, [], config.planning.steps / 1000, 7.0), [row]
+
+    monkeypatch.setattr(to_return.pipeline, "plan_and_evaluate", learn)
+    monkeypatch.setattr(to_return.reconnaissance, "learn_threats", lambda *_: (None, {}, {}))
+    out = tmp_path / "found.json"
+    words = ["--budgets", "1000", "2000", "4000", "--seeds", "2", "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", ["to_return", "--env", "circuit", *words])
+    to_return.main()
+    shown = capsys.readouterr().out
+    assert "all seeds past it: 4.0 s (4,000 steps)" in shown
+    for past in ("1 of 2", "2 of 2"):
+        assert past in shown
+    found = json.loads(out.read_text())
+    assert [row["seconds"] for row in found["rows"]] == [1, 1, 2, 2, 4, 4]
+    assert found["threat_seconds"] >= 0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--env", "point_gather"), "env is 'point_gather'; it must be one of 'circuit', 'jam'"),
+        (("--budgets", "10"), "budgets.steps is 10; it must be"),
+        (("--out", "nowhere/it.json"), "out is nowhere/it.json; its folder must exist"),
+        (("--seeds", "0"), "seeds is 0; it must be"),
+    ],
+)
+def test_bad_input_is_named(words, message, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["to_return", *words])
+    with pytest.raises(SystemExit, match="2"):
+        to_return.main()
+    assert message in capsys.readouterr().out
