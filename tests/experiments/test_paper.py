@@ -13,7 +13,17 @@ from tiny import programs_of_a_moment  # noqa: F401
 
 from experiments import all as everything
 from experiments import compare, tasks
-from experiments.paper import commands, fig5, published, scores, section, table1, tables3_4, walls
+from experiments.paper import (
+    commands,
+    fig5,
+    published,
+    scores,
+    section,
+    table1,
+    tables3_4,
+    thresholds,
+    walls,
+)
 from experiments.paper import training_crashes as crashes
 from experiments.runs import EXPERIMENTS
 from rp_jax import storage
@@ -100,6 +110,21 @@ def test_the_curves_claims_look_at_every_chunk(sources, tmp_path):
         assert level[claim].verdict == section.REPRODUCED
     safer = claims["Section 5.3, jam: safer than 3-step MPC"]
     assert safer.verdict == section.MISSED  # level
+
+
+def test_wider_is_said_only_where_the_ranks_say_it():
+    def verdicts(shares):
+        rows = [evaluated("N=8", "RP", seed, 0.0, 1.0) for seed in range(len(shares))]
+        rows = [
+            {**row, "planner": "separate", "x": 10.0**-i, "insecure": share, "seeds": 3}
+            for i, (row, share) in enumerate(zip(rows, shares, strict=True))
+        ]
+        (claim,) = thresholds.tell(rows).claims
+        return claim.verdict
+
+    assert verdicts([0.01, 0.02, 0.03, 0.04, 0.05]) == section.REPRODUCED
+    assert verdicts([0.05, 0.07, 0.03, 0.04, 0.06]) == section.MISSED
+    assert verdicts([0.05, 0.04, 0.03, 0.02, 0.01]) == section.MISSED
 
 
 def test_whether_returns_still_rise_is_said_of_the_last_tenth_of_the_steps():
