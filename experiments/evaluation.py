@@ -15,6 +15,8 @@ from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
 from rp_jax.envs.base import Env
 from rp_jax.planning.pmdp import PMDP
 
+ROUND = 1000  # episodes of an agent side by side
+
 
 class Agents(NamedTuple):
     """Who is evaluated."""
@@ -70,30 +72,38 @@ def play_all(
 ) -> tuple[dict[str, PMDP], dict[str, evaluate.Episodes]]:
     """By variant, the members' P-MDPs and their episodes (members, episodes)."""
     pmdp, axes = tasks.side_by_side(pmdp, agents.members)
-    batch = min(1000, config.episodes)
+    count, batch = len(agents.members), min(ROUND, config.episodes)
 
-    def one(key, params, pmdp):
-        policy = agents.policy(params)
-        return evaluate.play_episodes(key, pmdp, policy, config.episodes, batch=batch)
+    def one(key: jax.Array, params: Any, pmdp: PMDP) -> evaluate.Episodes:
+        return evaluate.play_round(key, pmdp, agents.policy(params), batch)
 
     mesh, places = devices.mesh_of(config.devices), (0, 0, axes)
     everyone = jax.jit(devices.spread(one, places, mesh))
     keys, params = tasks.keys_of(agents.members, tasks.EVALUATION), agents.trained.params
+    each = jax.vmap(lambda key: evaluate.round_keys(key, config.episodes, batch))(keys)
     variants = {name: pmdp.replace(params=test) for name, test in task.tests.items()}
+    rounds, names = each.shape[1], list(variants)
     with console.progress(f"{agents.names[0]}, evaluation") as bar:
 
         def play(i: int, found: dict[str, evaluate.Episodes]) -> dict[str, evaluate.Episodes]:
-            name, this = list(variants.items())[i]
-            bar("", i, len(variants), f"{name}: {config.episodes:,} episodes a seed")
-            given = devices.place((keys, params, this), places, mesh)
-            episodes = jax.tree.map(np.asarray, devices.gather(everyone(*given), mesh))
-            evaluate.check(episodes, name)
-            bar("", i + 1, len(variants))
-            return {**found, name: episodes}
+            name, turn = names[i // rounds], i % rounds
+            rows, begun = found[name], f"{turn * batch * count:,} of {rounds * batch * count:,}"
+            bar("", i, len(names) * rounds, f"{name}: {begun} episodes")
+            given = devices.place((each[:, turn], params, variants[name]), places, mesh)
+            new = jax.tree.map(np.asarray, devices.gather(everyone(*given), mesh))
+            evaluate.check(new, name)
+            for whole, part in zip(jax.tree.leaves(rows), jax.tree.leaves(new), strict=True):
+                whole[:, turn * batch : (turn + 1) * batch] = part
+            bar("", i + 1, len(names) * rounds)
+            return found
 
-        shapes = {name: jax.eval_shape(everyone, keys, params, p) for name, p in variants.items()}
-        blank = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), shapes)
-        return variants, checkpoints.loop(blank, play, len(variants))
+        shapes = jax.eval_shape(everyone, each[:, 0], params, variants[names[0]])
+        blank = {
+            name: jax.tree.map(lambda s: np.zeros((count, rounds * batch), s.dtype), shapes)
+            for name in names
+        }
+        found = checkpoints.loop(blank, play, len(names) * rounds)
+    return variants, jax.tree.map(lambda a: a[:, : config.episodes], found)
 
 
 def greedily(network: nn.Module) -> Callable[[Any], evaluate.Policy]:

@@ -83,48 +83,54 @@ def play_episodes(
     random_key("key", key)
     number("episodes", episodes, least=1, integer=True)
     number("batch", batch, least=1, integer=True)
-    rounds = -(-episodes // batch)
-
-    def one_round(key: Array) -> Episodes:
-        start_key, step_key, act_key = jax.random.split(key, 3)
-        keys = jax.random.split(step_key, batch)
-        starts = jax.random.split(start_key, batch)
-        states = jax.vmap(pmdp.env.reset, (0, None))(starts, pmdp.params)
-        zeros = jnp.zeros(batch, pmdp.x.dtype)
-        none = jnp.zeros(batch, bool)
-        kinds = jax.eval_shape(jax.vmap(pmdp.env.causes, (0, None)), states, pmdp.params)
-        causes = dict.fromkeys(kinds, none)
-        count = jnp.zeros(batch, jnp.int32)
-        rows = Episodes(zeros, zeros, none, count, count, count, causes, count, count)
-
-        def advance(carry):
-            t, alive, states, rows = carry
-            percept = pmdp.perceive(states, alive)
-            action, changed = policy(jax.random.fold_in(act_key, t), percept)
-            step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, t)
-            step = jax.vmap(pmdp.env.step, (0, 0, 0, None))
-            reached, outcome = step(step_keys, states, action, pmdp.params)
-            hit = jax.vmap(pmdp.env.causes, (0, None))(reached, pmdp.params)
-            bad_observation, bad_threat = faults(percept.encoded, percept.threat)
-            new = Episodes(
-                score=rows.score + outcome.reward,
-                danger=rows.danger + outcome.danger,
-                goal=outcome.goal,
-                length=rows.length + 1,
-                interventions=rows.interventions + changed,
-                insecure=rows.insecure + ~percept.secure,
-                causes=jax.tree.map(jnp.logical_or, rows.causes, hit),
-                bad_observations=rows.bad_observations + bad_observation,
-                bad_threats=rows.bad_threats + bad_threat,
-            )
-            rows = jax.vmap(select)(alive, new, rows)
-            return t + 1, alive & ~outcome.done, reached, rows
-
-        carry = (jnp.asarray(0), jnp.ones(batch, bool), states, rows)
-        return jax.lax.while_loop(lambda c: jnp.any(c[1]), advance, carry)[3]
-
-    rows = jax.lax.map(one_round, jax.random.split(key, rounds))
+    keys = round_keys(key, episodes, batch)
+    rows = jax.lax.map(lambda key: play_round(key, pmdp, policy, batch), keys)
     return jax.tree.map(lambda a: a.reshape(-1)[:episodes], rows)
+
+
+def round_keys(key: Array, episodes: int, batch: int) -> Array:
+    """(rounds,) one for each `play_round` of `play_episodes`."""
+    return jax.random.split(key, -(-episodes // batch))
+
+
+def play_round(key: Array, pmdp: PMDP, policy: Policy, batch: int) -> Episodes:
+    """`batch` episodes side by side; what `play_episodes` does as often as it needs to."""
+    start_key, step_key, act_key = jax.random.split(key, 3)
+    keys = jax.random.split(step_key, batch)
+    starts = jax.random.split(start_key, batch)
+    states = jax.vmap(pmdp.env.reset, (0, None))(starts, pmdp.params)
+    zeros = jnp.zeros(batch, pmdp.x.dtype)
+    none = jnp.zeros(batch, bool)
+    kinds = jax.eval_shape(jax.vmap(pmdp.env.causes, (0, None)), states, pmdp.params)
+    causes = dict.fromkeys(kinds, none)
+    count = jnp.zeros(batch, jnp.int32)
+    rows = Episodes(zeros, zeros, none, count, count, count, causes, count, count)
+
+    def advance(carry):
+        t, alive, states, rows = carry
+        percept = pmdp.perceive(states, alive)
+        action, changed = policy(jax.random.fold_in(act_key, t), percept)
+        step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, t)
+        step = jax.vmap(pmdp.env.step, (0, 0, 0, None))
+        reached, outcome = step(step_keys, states, action, pmdp.params)
+        hit = jax.vmap(pmdp.env.causes, (0, None))(reached, pmdp.params)
+        bad_observation, bad_threat = faults(percept.encoded, percept.threat)
+        new = Episodes(
+            score=rows.score + outcome.reward,
+            danger=rows.danger + outcome.danger,
+            goal=outcome.goal,
+            length=rows.length + 1,
+            interventions=rows.interventions + changed,
+            insecure=rows.insecure + ~percept.secure,
+            causes=jax.tree.map(jnp.logical_or, rows.causes, hit),
+            bad_observations=rows.bad_observations + bad_observation,
+            bad_threats=rows.bad_threats + bad_threat,
+        )
+        rows = jax.vmap(select)(alive, new, rows)
+        return t + 1, alive & ~outcome.done, reached, rows
+
+    carry = (jnp.asarray(0), jnp.ones(batch, bool), states, rows)
+    return jax.lax.while_loop(lambda c: jnp.any(c[1]), advance, carry)[3]
 
 
 def check(rows: Episodes, name: str) -> None:
