@@ -7,7 +7,8 @@ COMMANDS: dict[str, str] = {
     "frozen_lake": "frozen_lake --no-figures {frozen_lake}",
     "theorems": "theorems --instances {instances}",
     # RP, with the tuned recipe and the paper's baseline policy, and under plans.
-    "circuit": "circuit {seeds} {circuit_steps} {wall} --lost 0.1",
+    "circuit": "circuit {seeds} {circuit_steps} {wall}",
+    "circuit_lost": "circuit {seeds} {circuit_steps} {wall} --lost 0.1",
     "jam": "jam {seeds} {jam_steps} {wall} {obstacle} --test-obstacles 3 8 15 30 50",
     "point_gather": "point_gather {seeds} {gather_steps} {bomb}",
     "point_gather_x01": "point_gather {seeds} {gather_steps} --x 0.1 --threat @point_gather/threat"

@@ -22,8 +22,9 @@ EPISODES, STEPS_AHEAD = 8, 4
 
 def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
     """Per method and track, where the agent went, and where it crashed; keeps an animation."""
-    loaded = runs.load(sources("circuit"))
-    (folder / "animation.gif").write_bytes((sources("circuit") / "animation.gif").read_bytes())
+    lost = sources("circuit_lost")
+    loaded = runs.load(lost)
+    (folder / "animation.gif").write_bytes((lost / "animation.gif").read_bytes())
     planning = loaded.config.planning
     agents = sources("dqn_circuit") / "dqn" / "agent"
     members = storage.read_manifest(agents, "Q-network")["about"]["members"]
@@ -87,7 +88,8 @@ def tell(results: list[dict[str, Any]]) -> Section:
     said = "; ".join(f"{m}, {t}: {n} of {EPISODES}" for (m, t), n in crashed.items())
     return Section(
         f"{EPISODES} episodes each. S: start; crosses: crashes. No seed was chosen: it is the "
-        "first agent of each.",
+        "first agent of each. RP: with the paper's baseline policy, and not told x and y where it "
+        "did not learn.",
         claims=[
             Claim(
                 "Figure 6: RP crashes on no track; unpenalised DQN crashes on the new ones",

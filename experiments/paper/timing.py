@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments import console, evaluation, mpc, policy_gradient, runs, tasks
 from experiments.paper import published
-from experiments.paper.scores import RP, RUNS, read
+from experiments.paper.scores import PLANS, RP, RUNS, read
 from experiments.paper.section import EXCEEDED, MISSED, Claim, Section, Table, holds
 from rp_jax.baselines import actor_critic
 from rp_jax.baselines.cpo import CPOConfig
@@ -19,6 +19,7 @@ from rp_jax.planning.pmdp import PMDP
 
 TITLE = "Computation time"
 SEARCHES = {"circuit": (3, 4, 5), "jam": (2, 3), "point_gather": (1, 2)}
+TIMED = {**RUNS, "circuit": {RP: "circuit_lost", PLANS: "circuit_plans"}}  # of each kind of network
 VARIANTS = {"jam": "N=8"}  # elsewhere the first
 ROUNDS = 3
 STEPS = 3_000_000  # that the paper's agents learn in
@@ -29,7 +30,7 @@ def run(sources: Any, folder: Path) -> dict[str, Any]:
     """A row per task and method: wall time of each round; a row per task: of learning."""
     rows, learning = [], []
     for env in SEARCHES:
-        folders = {method: sources(name) for method, name in RUNS[env].items()}
+        folders = {method: sources(name) for method, name in TIMED[env].items()}
         own = {method: runs.load(folder) for method, folder in folders.items()}
         learning.append(learned(own[RP], folders[RP]))
         timers = timers_of(env, own)

@@ -20,7 +20,7 @@ from rp_jax.threat import report
 from rp_jax.threat.total import total_threat
 
 TITLE = "Walls: summed or jointly"
-TASKS = ("circuit", "jam")
+RUNS = {"circuit": "circuit_lost", "jam": "jam"}  # of which agents were kept
 STATES = 256
 BINS = (0.0, 1e-3, 1e-2, 1e-1, 1.0)  # of the joint threat
 
@@ -46,8 +46,8 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
     Joint and summed threats are exact: all rollouts are enumerated.
     """
     rows = []
-    for env in TASKS:
-        loaded = runs.load(sources(env))
+    for env, name in RUNS.items():
+        loaded = runs.load(sources(name))
         pmdp = loaded.pmdp(next(iter(loaded.task.tests)))
         key = tasks.key_of(loaded.config.seed, tasks.SUMS)
         states = jax.jit(evaluate.visited_states, static_argnums=2)(key, pmdp, STATES)

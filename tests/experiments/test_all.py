@@ -273,8 +273,8 @@ def test_each_result_is_listed_and_each_run_used():
 @pytest.fixture
 def circuit_runs(finished, tmp_path):
     """What fig6, timing and walls load: the tiny run of Circuit, also as that of DQN."""
-    shutil.copytree(finished, tmp_path / "circuit")
-    picture(tmp_path / "circuit" / "animation.gif")
+    shutil.copytree(finished, tmp_path / "circuit_lost")
+    picture(tmp_path / "circuit_lost" / "animation.gif")
     shutil.copytree(finished / "agent", tmp_path / "dqn_circuit" / "dqn" / "agent")
     return lambda name: tmp_path / name
 
@@ -301,7 +301,7 @@ def test_trajectories_of_three_methods(circuit_runs, tmp_path, monkeypatch):
 def test_all_methods_are_timed_in_one_process(circuit_runs, tmp_path, monkeypatch):
     monkeypatch.setattr(timing, "SEARCHES", {"circuit": (1, 4)})
     monkeypatch.setattr(timing, "ROUNDS", 1)
-    monkeypatch.setattr(timing, "RUNS", {"circuit": {"RP": "circuit"}})
+    monkeypatch.setattr(timing, "TIMED", {"circuit": {"RP": "circuit_lost"}})
     monkeypatch.setattr(timing.mpc, "action_seconds", lambda key, search: (search.horizon, 0.0))
     results = timing.run(circuit_runs, tmp_path)
     found = {row["method"]: row["seconds"] for row in results["actions"]}
@@ -335,7 +335,7 @@ def test_walls_jointly_are_never_more_threatening_than_summed():
 
 def test_what_walls_admit_is_a_row_each(circuit_runs, tmp_path, monkeypatch):
     joint = np.zeros((8, 15), np.float32)
-    monkeypatch.setattr(walls, "TASKS", ("circuit",))
+    monkeypatch.setattr(walls, "RUNS", {"circuit": "circuit_lost"})
     monkeypatch.setattr(walls, "STATES", 8)
     monkeypatch.setattr(walls, "exact", lambda *_: (joint, joint + 0.5))
     rows = walls.run(circuit_runs, tmp_path)

@@ -80,6 +80,7 @@ def test_crashes_while_learning_are_those_of_all_chunks_and_seeds(sources, tmp_p
     assert set(found) == {
         *((env, method) for env in RP for method in ("RP", "CPO", "PID-Lagrangian")),
         *((env, "RP, plans") for env in ("circuit", "jam")),
+        ("circuit", "RP, lost"),
         ("jam", "RP, plans, one step ahead"),
         ("point_gather", "RP, x = .1"),
         *(("circuit", f"DQN (penalty {p})") for p in (0, 20, 200)),
@@ -240,7 +241,7 @@ def test_commands_are_understood(name, preset):
     for word in commands.words(name, preset):
         if word.startswith("@"):
             assert word[1:].partition("/")[0] in commands.COMMANDS
-    if preset == "full" and name in ("jam", "circuit", "point_gather", "jam_plans"):
+    if preset == "full" and name in ("jam", "circuit", "circuit_lost", "point_gather", "jam_plans"):
         assert (config.seeds, config.episodes) == (10, 10_000)
     if preset == "full" and name.startswith(("dqn", "cpo", "pid")):
         of = parsed(config.env, preset)
