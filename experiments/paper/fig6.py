@@ -32,7 +32,8 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
     found = []
     for track in TRACKS:
         pmdp = loaded.pmdp(track)
-        free = pmdp.replace(threats=None, x=jnp.asarray(jnp.inf))
+        told = pmdp.params.replace(lost=jnp.zeros(()))  # as DQN has learned
+        free = pmdp.replace(params=told, threats=None, x=jnp.asarray(jnp.inf))
         dqn = runs.agents(agents, free, planning, len(members))
         network = loop.make_network(planning, pmdp)
         greedy = functools.partial(evaluate.greedy, network)
