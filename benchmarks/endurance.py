@@ -66,8 +66,7 @@ def train(config: Config) -> Iterator[dict[str, float]]:
     init = jax.jit(lambda key, pmdp: loop.init(key, pmdp, learning))
     state, metrics = init(jax.random.key(0), pmdp)
     began, steps, wrong = time.monotonic(), int(metrics.steps), int(metrics.inadmissible)
-    going = True  # once at least
-    while going:
+    while True:
         state, metrics = chunk(state, pmdp)
         steps += int(metrics.steps)
         wrong += int(metrics.inadmissible)
@@ -79,7 +78,8 @@ def train(config: Config) -> Iterator[dict[str, float]]:
             "megabytes": memory(),
             "traces": traces,
         }
-        going = steps < config.steps and time.monotonic() - began < 60 * config.minutes
+        if steps >= config.steps or time.monotonic() - began >= 60 * config.minutes:
+            return
 
 
 def summary(rows: Sequence[dict[str, float]]) -> dict[str, Any]:

@@ -114,8 +114,7 @@ def main() -> None:
     config = tyro.cli(Config, prog="python -m benchmarks.to_return", description=__doc__)
     with cli.bad_input():
         settings, task = prepare(config)
-        if config.out is not None and not config.out.parent.is_dir():
-            raise ValueError(f"out is {config.out}; its folder must exist")
+        cli.needs_folder(config.out)
     found = run(config, settings, task)
     show(found, config.env)
     if config.out is not None:

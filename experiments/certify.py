@@ -114,8 +114,7 @@ def main() -> None:
     """Exits with 1 where nothing is shown, with 2 on bad input."""
     config = tyro.cli(Config, description=__doc__)
     with cli.bad_input():
-        if config.out is not None and not config.out.parent.is_dir():
-            raise ValueError(f"out is {config.out}; its folder must exist")
+        cli.needs_folder(config.out)
         row = run(config)
         if config.out is not None:
             storage.write_json(config.out, row)

@@ -56,23 +56,23 @@ def make_task(config: Config) -> tasks.Task:
     if not config.test_tracks:
         raise ValueError("test_tracks is (); it must name at least one track")
 
-    def params(track: str) -> circuit.Params:
-        return circuit.make_params(track, fidelity=config.fidelity, baseline=config.baseline)
+    def params(track: str, lost: float = 0.0) -> circuit.Params:
+        return circuit.make_params(
+            track, fidelity=config.fidelity, baseline=config.baseline, lost=lost
+        )
 
-    def lost(params: circuit.Params, chance: float) -> circuit.Params:
-        return params.replace(lost=jax.numpy.asarray(chance, float))
+    train = params(config.track, config.lost)
 
-    home = params(config.track)
-    tests = {track: params(track) for track in config.test_tracks}
-    if config.lost > 0:
-        for track, found in tests.items():
-            if not np.array_equal(found.track.centre, home.track.centre):
-                tests[track] = lost(found, 1.0)
+    def test(track: str) -> circuit.Params:
+        found = params(track)
+        elsewhere = not np.array_equal(found.track.centre, train.track.centre)
+        return found.replace(lost=jax.numpy.asarray(elsewhere and config.lost > 0, float))
+
     return tasks.Task(
         name="circuit",
         env=circuit,
-        train=lost(home, config.lost),
-        tests=tests,
+        train=train,
+        tests={track: test(track) for track in config.test_tracks},
         threats={"wall": config.wall},
         draw=draw,
     )

@@ -135,6 +135,12 @@ def needs_matplotlib(figures: bool) -> None:
         )
 
 
+def needs_folder(out: Path | None) -> None:
+    """Raises ValueError if a file that is written at the end could not be."""
+    if out is not None and not out.parent.is_dir():
+        raise ValueError(f"out is {out}; its folder must exist")
+
+
 @contextmanager
 def bad_input() -> Iterator[None]:
     """Turns a ValueError into a message and exit code 2; numbers that are none, into 1."""

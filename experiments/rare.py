@@ -205,12 +205,22 @@ def known_starts(folder: Path, pmdp: PMDP, about: dict[str, Any]) -> Any:
     return storage.load(folder, STARTS, like)
 
 
+def chosen(config: Config, loaded: runs.Run) -> tuple[runs.Subject, dict[str, Any], Any]:
+    """The agent, what results say of it, and the starts that were found before, or None.
+
+    Raises:
+        ValueError: there is no such test, agent or set of starts.
+    """
+    subject = loaded.subject(config.variant, config.agent)
+    about = {"env": loaded.task.name, "variant": subject.variant, "sha256": loaded.sha256}
+    known = None if config.starts is None else known_starts(config.starts, subject.pmdp, about)
+    return subject, about, known
+
+
 def run(config: Config, loaded: runs.Run, folder: Path) -> dict[str, Any]:
     """Writes rare.json and, after a search, the folder worst_starts."""
-    variant, pmdp, network, weights = loaded.subject(config.variant, config.agent)
-    about = {"env": loaded.task.name, "variant": variant, "sha256": loaded.sha256}
+    (_, pmdp, network, weights), about, known = chosen(config, loaded)
     row: dict[str, Any] = {**about, "seed": config.seed}
-    known = None if config.starts is None else known_starts(config.starts, pmdp, about)
     values = evaluate.greedy(network, weights)
     subject = Subject(pmdp, values, rare.compiled(values))
     key, search, check = jax.random.split(tasks.key_of(config.seed, tasks.RARE), 3)
@@ -274,11 +284,7 @@ def main() -> None:
     with cli.bad_input():
         config.validate()
         loaded = runs.load(config.run)
-        about = {"variant": loaded.subject(config.variant, config.agent).variant}
-        if config.starts is not None:
-            known_starts(
-                config.starts, loaded.pmdp(about["variant"]), about | {"env": loaded.task.name}
-            )
+        chosen(config, loaded)
         folder = storage.new_folder(config.out)
         storage.write_json(folder / "config.json", dataclasses.asdict(config))
         run(config, loaded, folder)

@@ -96,6 +96,7 @@ def main() -> None:
     config = tyro.cli(Config, description=__doc__)
     with cli.bad_input():
         config.validate()
+        cli.needs_folder(config.out)
     rows = run(config)
     shown = [
         {

@@ -74,6 +74,7 @@ def run(config: Config) -> list[dict[str, Any]]:
 if __name__ == "__main__":
     chosen = tyro.cli(Config, description=__doc__)
     with cli.bad_input():
+        cli.needs_folder(chosen.out)
         found = run(chosen)
         if chosen.out is not None:
             storage.write_json(chosen.out, found)

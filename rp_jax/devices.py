@@ -89,7 +89,12 @@ def place(arguments: tuple, in_axes: Any, mesh: Mesh | None) -> tuple:
     if mesh is None:
         return arguments
     shardings = jax.tree.map(lambda spec: NamedSharding(mesh, spec), _specs(in_axes))
-    return jax.jit(lambda *same: same, out_shardings=shardings)(*arguments)
+    return jax.jit(_same, out_shardings=shardings)(*arguments)
+
+
+def _same(*arguments: Any) -> tuple:
+    """By name, so that it is compiled once for all calls alike."""
+    return arguments
 
 
 def placed(shapes: Any, mesh: Mesh | None) -> Any:

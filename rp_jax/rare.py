@@ -74,6 +74,7 @@ def advance(key: Array, paths: Paths, pmdp: PMDP, values: Values, level: Array) 
         now = jax.vmap(jax.random.fold_in, (0, None))(keys, t)
         move = jax.vmap(pmdp.env.step, (0, 0, 0, None))
         states, outcome = move(now, paths.states, action, pmdp.params)
+        bad_observation, bad_threat = faults(percept.encoded, percept.threat)
         crashed = alive & (outcome.danger > 0)
         paths = Paths(
             states=jax.vmap(select)(alive, states, paths.states),
@@ -82,8 +83,7 @@ def advance(key: Array, paths: Paths, pmdp: PMDP, values: Values, level: Array) 
             crashed=paths.crashed | crashed,
             reached=paths.reached | there | crashed,
             length=paths.length + alive,
-            bad=paths.bad
-            | (alive & jnp.any(jnp.stack(faults(percept.encoded, percept.threat)), 0)),
+            bad=paths.bad | (alive & (bad_observation | bad_threat)),
         )
         return t + 1, alive & ~outcome.done & ~crashed, paths
 

@@ -3,7 +3,6 @@
 python tests/spreading.py SETTING prints what is equal, as JSON; started by test_devices.py.
 """
 
-import contextlib
 import dataclasses
 import json
 import sys
@@ -15,9 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import probe
+import pytest
+from quick import stopped_after
 
 from experiments import planning, tasks
-from rp_jax import checkpoints, devices
+from rp_jax import devices
+from rp_jax.checkpoints import Checkpoints
 from rp_jax.planning import loop
 from rp_jax.recon import labels, sampling
 
@@ -58,25 +60,15 @@ def resumed(folder):
     task = make_task(config)
     pmdp = tasks.make_pmdp(task, config, None, task.train)
     members = tasks.members_of(config)
-    checkpoints.INTERVAL, checkpoints.SHARE = 0.0, float("inf")
-    whole, check, calls = planning.loop.check, planning.loop.check, []
 
-    def interrupted(*arguments):
-        calls.append(None)
-        if len(calls) == 12:
-            raise KeyboardInterrupt
-        check(*arguments)
+    def learn(name):
+        (folder / name).mkdir(exist_ok=True)
+        kept = Checkpoints(folder / name / "checkpoints", run="a")
+        return planning.plan(config, pmdp, members, folder / name, kept.at("planning")).params
 
-    found = []
-    for name, checks in {"apart": (interrupted, whole), "at_once": (whole,)}.items():
-        (folder / name).mkdir()
-        kept = checkpoints.Checkpoints(folder / name / "checkpoints", run="a")
-        for planning.loop.check in checks:
-            with contextlib.suppress(KeyboardInterrupt):
-                trained = planning.plan(config, pmdp, members, folder / name, kept.at("planning"))
-        found.append(trained.params)
-    assert len(calls) == 12
-    return found
+    with stopped_after(11, pytest.MonkeyPatch()), pytest.raises(KeyboardInterrupt):
+        learn("apart")
+    return learn("apart"), learn("at_once")
 
 
 def equal(a, b):

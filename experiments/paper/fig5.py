@@ -62,15 +62,14 @@ def tell(results: dict[str, Any]) -> Section:
     for env, of in results.items():
         for row in scores.summed_up(of["evaluated"] + of["levels"]):
             learned.append(line(env, row))
+    rising = [row for env, of in results.items() for row in rise(env, of)]
     claims = [claim for env in ("circuit", "jam") for claim in _ahead(results[env], env)]
     return Section(
         f"{len(seeds)} seed(s); lines are means over seeds, bands 90 % intervals. Curves show the "
         "agents as they explore; the table, the learned agents. MPC does not learn.",
         tables=[
             Table("After learning, on the task that was learned", learned),
-            Table(
-                "Whether returns still rise", [r for e, of in results.items() for r in rise(e, of)]
-            ),
+            Table("Whether returns still rise", rising),
         ],
         claims=[*claims, *_gather(results["point_gather"])],
         figures={

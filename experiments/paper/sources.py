@@ -54,10 +54,7 @@ class Sources:
                 other, _, file = word[1:].partition("/")
                 rest[i] = str(self(other) / file)
         log = read(folder / LOG) if (folder / LOG).exists() else []
-        if resumable(folder) and not of_this_code(folder):
-            console.say(f"{folder}: it was begun by other code, and begins anew", style="yellow")
-            shutil.rmtree(folder)
-        if resumable(folder):
+        if resumable(folder) and goes_on(folder, f"experiments.{module}"):
             rest = ["--resume", str(folder)]
         else:
             shutil.rmtree(folder, ignore_errors=True)
@@ -106,10 +103,14 @@ def resumable(folder: Path) -> bool:
     return _begun(folder) and (folder / settings.CHECKPOINTS).is_dir()
 
 
-def of_this_code(folder: Path) -> bool:
-    """The run in the folder was begun by what would go on with it, on a machine like this."""
-    found = settings.read(folder)
-    return all(found.get(name) == here for name, here in settings.machine().items())
+def goes_on(folder: Path, experiment: str) -> bool:
+    """Whether the experiment would go on with the run here; says why not."""
+    try:
+        settings.interrupted(folder, experiment)
+    except ValueError as error:
+        console.say(f"{error}; it begins anew", style="yellow")
+        return False
+    return True
 
 
 def _begun(folder: Path) -> bool:

@@ -15,6 +15,7 @@ from experiments.paper.scores import AHEAD, PLANS, RP, read
 from experiments.paper.section import EXCEEDED, MISSED, Claim, Section, Table, holds
 from rp_jax.baselines import actor_critic
 from rp_jax.baselines.cpo import CPOConfig
+from rp_jax.baselines.mpc import make_search
 from rp_jax.planning.pmdp import PMDP
 
 TITLE = "Computation time"
@@ -94,8 +95,10 @@ def timers_of(env: str, own: dict[str, runs.Run]) -> dict[str, Callable[[], tupl
     start = jax.vmap(free.env.reset, (0, None))(jax.random.split(key, 1), free.params)
     weights = actor.init(key, free.perceive(start).encoded)
     add("CPO", free, policy_gradient.modes(CPOConfig(), free), weights)
+    model: Any = free.env
+    avoided = mpc.AVOIDED.get(env, own[RP].config.penalty)
     for steps in SEARCHES[env]:
-        _, (search, *_), _ = mpc.prepare(mpc.Config(env, steps, variants=(subject.variant,)))
+        search = make_search(model, free.params, steps, avoided)
         found[f"MPC ({steps} steps)"] = functools.partial(mpc.action_seconds, key, search)
     return found
 

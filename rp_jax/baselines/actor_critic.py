@@ -17,7 +17,7 @@ from jax import Array
 
 from rp_jax.baselines.policies import ACTORS, Critic
 from rp_jax.envs import base
-from rp_jax.planning.pmdp import PMDP, Encoded, Percept, faults, not_finite
+from rp_jax.planning.pmdp import PMDP, Encoded, Percept, faults
 from rp_jax.validate import number, one_of
 
 REWARD, DANGER = range(2)  # places of the two signals
@@ -253,6 +253,7 @@ def collect(
         step = _Step(encoded, elapsed, action, signal, value, next_value, outcome.done)
         score, danger = sums[0] + outcome.reward, sums[1] + outcome.danger
         earned = config.gamma * sums[2] + reward
+        bad_observation, bad_signal = faults(encoded, signal)
         metrics = Metrics(
             steps=jnp.asarray(config.num_envs, score.dtype),
             episodes=jnp.sum(outcome.done, dtype=score.dtype),
@@ -260,8 +261,8 @@ def collect(
             danger=jnp.sum(jnp.where(outcome.done, danger, 0.0)),
             crashes=jnp.sum(outcome.done & (danger > 0), dtype=score.dtype),
             goals=jnp.sum(outcome.goal, dtype=score.dtype),
-            bad_observations=jnp.sum(faults(encoded, signal)[0], dtype=score.dtype),
-            bad_rewards=jnp.sum(not_finite(signal), dtype=score.dtype),
+            bad_observations=jnp.sum(bad_observation, dtype=score.dtype),
+            bad_rewards=jnp.sum(bad_signal, dtype=score.dtype),
         )
         running = [jnp.where(outcome.done, 0.0, total) for total in (score, danger, earned)]
         return (*carried, *running), (step, metrics, jnp.sum(jnp.square(earned)))

@@ -42,7 +42,9 @@ class Runs:
         self.stops.discard(folder.name)
         status = 130 if stops else self.exits.get(folder.name, 0)
         if status != 2:  # which is bad input, before anything is written
-            storage.write_json(folder / "config.json", {"experiment": "it"} | settings.machine())
+            storage.write_json(
+                folder / "config.json", {"experiment": command[2]} | settings.machine()
+            )
         checkpoints = folder / settings.CHECKPOINTS
         if stops:
             checkpoints.mkdir()
