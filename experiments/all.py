@@ -26,6 +26,7 @@ import tyro
 from experiments import cli, console, pipeline, report, settings
 from experiments.paper import (
     ablations,
+    brief,
     crowds,
     fig2,
     fig3,
@@ -53,7 +54,7 @@ from rp_jax import storage
 from rp_jax.validate import one_of
 
 MODULES: tuple[ModuleType, ...] = (
-    *(fig2, fig3, fig4, fig5, fig6, table1, table2, tables3_4, timing, theorems),
+    *(fig2, fig3, fig4, fig5, fig6, table1, table2, tables3_4, timing, brief, theorems),
     *(training_crashes, more_steps, paper_recipe, thresholds, crowds, second_reward, ablations),
     walls,
 )
@@ -104,7 +105,7 @@ def make(names: Sequence[str], sources: Sources, folder: Path) -> dict[str, str]
                 result(RESULTS[name], sources, folder / name)
             else:
                 sources(name)
-        except RunError as error:
+        except (RunError, storage.StorageError) as error:
             failed[name] = str(error)
         except Exception as error:  # whatever it is, the others are not to suffer
             traceback.print_exc()

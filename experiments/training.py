@@ -139,9 +139,12 @@ def history(learners: Learners, record: Record, done: int) -> list[dict[str, Any
 
 def note(rows: Sequence[Mapping]) -> str:
     """Return and crashes of the last chunk, for the progress bar."""
-    returns = np.mean([row["return_mean"] for row in rows])
-    crashes, ended = sum(r["crashes"] for r in rows), sum(r["episodes"] for r in rows)
-    return f"return {returns:.1f}, {crashes} crashes in {ended} episodes"
+    ended = [row for row in rows if row["episodes"]]
+    if not ended:
+        return "no episode ended"
+    returns = np.mean([row["return_mean"] for row in ended])
+    crashes, count = sum(row["crashes"] for row in ended), sum(row["episodes"] for row in ended)
+    return f"return {returns:.1f}, {crashes} crashes in {count} episodes"
 
 
 def write_lines(path: Path, rows: Sequence[Mapping]) -> None:

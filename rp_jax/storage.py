@@ -110,8 +110,10 @@ def new_folder(path: Path) -> Path:
 
 
 @contextlib.contextmanager
-def locked(folder: Path, name: str) -> Iterator[None]:
+def locked(folder: Path, name: str) -> Iterator[int]:
     """Keeps other processes from entering a folder; ends with the process, however that ends.
+
+    Yields the lock's descriptor: a process that is given it holds the lock too.
 
     Args:
         folder: named in messages.
@@ -134,7 +136,7 @@ def locked(folder: Path, name: str) -> Iterator[None]:
             pass  # a file system without locks
         if not path.exists():
             raise StorageError(f"{folder}: another process has just finished in this folder")
-        yield
+        yield file.fileno()
 
 
 def leaves(tree: Any) -> dict[str, np.ndarray]:

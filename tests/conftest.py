@@ -1,4 +1,6 @@
 import gc
+import os
+import tempfile
 from pathlib import Path
 
 import jax
@@ -14,6 +16,17 @@ MAPS = Path("/proc/self/maps")  # where the system has it
 jax.config.update("jax_numpy_rank_promotion", "raise")
 settings.register_profile("rp_jax", deadline=None, derandomize=True, database=None, max_examples=30)
 settings.load_profile("rp_jax")
+
+
+def pytest_configure(config):
+    """All processes of a run of the tests, and those that tests begin, compile a program once."""
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        programs = tempfile.TemporaryDirectory(prefix="programs-")
+        config.add_cleanup(programs.cleanup)
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = programs.name  # of processes that begin later
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.5"
+        jax.config.update("jax_compilation_cache_dir", programs.name)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def pytest_collection_modifyitems(items):

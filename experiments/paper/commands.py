@@ -19,6 +19,9 @@ COMMANDS: dict[str, str] = {
     "jam_ahead": "jam {few} {jam_steps} --baseline plans --x 0.002 --lookahead 8 --learning-toll 1"
     " --learning-penalty 50 --fewest-obstacles 0 --threat @jam_plans/threat"
     " --test-obstacles 3 8 15 30 50 --no-figures",
+    # As many steps as the paper's returns need (benchmarks.to_return).
+    "circuit_brief": "circuit {seeds} {circuit_brief} --baseline plans --lost 0.1 --no-figures",
+    "jam_brief": "jam {seeds} {jam_brief} {wall} {obstacle} --no-figures",
     # The paper's networks and settings, its threat functions included.
     "circuit_paper": "circuit --recipe paper {episodes} {paper_steps} {paper_wall}",
     "jam_paper": "jam --recipe paper {episodes} {paper_steps} {paper_wall} {paper_obstacle}",
@@ -62,6 +65,8 @@ SIZES: dict[str, dict[str, str]] = {
         "episodes": "--preset full --episodes 10000",
         "circuit_steps": "",
         "jam_steps": "",
+        "circuit_brief": "--planning.steps 900000",
+        "jam_brief": "--planning.steps 400000",
         "gather_steps": "",
         "paper_steps": "",
         "wall": "",
@@ -87,6 +92,8 @@ SIZES: dict[str, dict[str, str]] = {
         "episodes": "--episodes 1000",
         "circuit_steps": "--planning.steps 200000",
         "jam_steps": "--planning.steps 200000",
+        "circuit_brief": "--planning.steps 100000",
+        "jam_brief": "--planning.steps 100000",
         "gather_steps": "--planning.steps 200000",
         "paper_steps": "--planning.steps 20000",
         "wall": "--wall.states 20000 " + _FIT.format("wall"),

@@ -1,13 +1,10 @@
 """Runs that results are taken from: each made once, in a process of its own, and resumed."""
 
-import fcntl
 import resource
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,14 +32,16 @@ class Sources:
         """The folder of a finished run; makes or resumes the run, and those that it uses, first.
 
         Raises:
-            RunError: it ended with an error, now or earlier in this process, or another process
-                is making it.
+            RunError: it ended with an error, now or earlier in this process.
+            storage.StorageError: another process is making it.
             KeyboardInterrupt: it was interrupted.
         """
         folder = self._folder / name
         if name in self._failed:
             raise RunError(self._failed[name])
-        with locked(self._folder / ".locks" / name) as lock:
+        place = self._folder / ".locks" / name
+        place.mkdir(parents=True, exist_ok=True)
+        with storage.locked(place, "lock") as lock:
             if not finished(folder):
                 self._make(name, folder, lock)
         return folder
@@ -71,22 +70,6 @@ class Sources:
         if ended["exit"] != 0:
             self._failed[name] = f"{entry['command']}: exit status {ended['exit']}"
             raise RunError(self._failed[name])
-
-
-@contextmanager
-def locked(path: Path) -> Iterator[int]:
-    """Holds a lock as long as this process, or one that was given its descriptor, lives.
-
-    Raises:
-        RunError: another process holds it.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise RunError(f"{path.name}: another process is making this run") from error
-        yield file.fileno()
 
 
 def finished(folder: Path) -> bool:

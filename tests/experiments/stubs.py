@@ -100,6 +100,8 @@ class Stub:
                 history += learned(other, self.seeds, 0.6)
         storage.write_json(folder / "table.json", found)
         write_lines(folder / "metrics.jsonl", history)
+        parts = {"reconnaissance": 120.0, "planning_compilation": 30.0, "planning": 180.0}
+        storage.write_json(folder / "training.json", {"steps": 400, "seconds": parts})
         picture(folder / "animation.gif")
         for figure in ("threat_of_one_obstacle", "threat_of_all", "trajectories"):
             picture(folder / "figures" / f"{figure}.png")

@@ -125,8 +125,9 @@ def test_an_interrupted_run_that_was_resumed_by_itself_is_finished(runs, tmp_pat
 
 def test_a_run_that_another_process_makes_is_left_alone(runs, tmp_path):
     sources = module.Sources(tmp_path, "quick")
-    with module.locked(tmp_path / ".locks" / "jam"):
-        with pytest.raises(module.RunError, match="jam: another process"):
+    (tmp_path / ".locks" / "jam").mkdir(parents=True)
+    with storage.locked(tmp_path / ".locks" / "jam", "lock"):
+        with pytest.raises(storage.StorageError, match="jam: another process"):
             sources("jam")
         assert runs.commands == []
     assert sources("jam").exists()  # later it can be had

@@ -14,6 +14,7 @@ from tiny import programs_of_a_moment  # noqa: F401
 from experiments import all as everything
 from experiments import compare, tasks
 from experiments.paper import (
+    brief,
     commands,
     fig5,
     published,
@@ -95,6 +96,18 @@ def test_crashes_while_learning_are_those_of_all_chunks_and_seeds(sources, tmp_p
     (bombs,) = (row for row in rows if (row["env"], row["method"]) == ("point_gather", "RP"))
     assert crashes._keeps({**bombs, "danger": 0.1})  # c is of bombs, however many episodes
     assert not crashes._keeps({**bombs, "crash_rate": 0.05, "danger": 0.11})
+
+
+def test_how_long_ten_agents_take_is_held_against_the_goal(sources, tmp_path):
+    results = made("brief", sources, tmp_path / "brief")
+    told = brief.tell(results)
+    assert "within 10 minutes; together 11.0 minutes, 1.0 more than wanted." in told.text
+    assert [row["seeds"] for row in told.tables[-1].rows] == [2, 2]
+    assert {row["variant"] for row in told.tables[1].rows} == {"N=3", "N=8", "N=15"}
+    results["jam"]["seconds"]["planning"] = 60.0
+    assert "together 9.0 minutes. " in brief.tell(results).text
+    resumed = {**results, "jam": {**results["jam"], "resumed": True}}
+    assert "a run was resumed" in brief.tell(resumed).text
 
 
 def test_the_curves_claims_look_at_every_chunk(sources, tmp_path):
