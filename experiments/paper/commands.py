@@ -20,8 +20,8 @@ COMMANDS: dict[str, str] = {
     " --learning-penalty 50 --fewest-obstacles 0 --threat @jam_plans/threat"
     " --test-obstacles 3 8 15 30 50 --no-figures",
     # As many steps as the paper's returns need (benchmarks.to_return).
-    "circuit_brief": "circuit {seeds} {circuit_brief} --baseline plans --lost 0.1 --no-figures",
-    "jam_brief": "jam {seeds} {jam_brief} {wall} {obstacle} --no-figures",
+    "circuit_brief": "circuit {brief} {circuit_brief} --baseline plans --lost 0.1 --no-figures",
+    "jam_brief": "jam {brief} {jam_brief} {wall} {obstacle} --no-figures",
     # The paper's networks and settings, its threat functions included.
     "circuit_paper": "circuit --recipe paper {episodes} {paper_steps} {paper_wall}",
     "jam_paper": "jam --recipe paper {episodes} {paper_steps} {paper_wall} {paper_obstacle}",
@@ -61,6 +61,7 @@ SIZES: dict[str, dict[str, str]] = {
         "frozen_lake": "",
         "instances": "200000",
         "seeds": "--preset full --episodes 10000",
+        "brief": "--preset full --episodes 2000",
         "few": "--preset full --seeds 3 --episodes 4000",
         "episodes": "--preset full --episodes 10000",
         "circuit_steps": "",
@@ -88,6 +89,7 @@ SIZES: dict[str, dict[str, str]] = {
         "frozen_lake": "--horizons 100 --no-program",
         "instances": "2000",
         "seeds": "--episodes 1000",
+        "brief": "--episodes 1000",
         "few": "--episodes 1000",
         "episodes": "--episodes 1000",
         "circuit_steps": "--planning.steps 200000",

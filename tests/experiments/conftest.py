@@ -22,9 +22,7 @@ def once(tmp_path_factory, name, *options):
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory):
     """A whole run of Circuit, two seeds, without figures."""
-    return once(
-        tmp_path_factory, "circuit", "--no-figures --track circle --test-tracks circle"
-    )
+    return once(tmp_path_factory, "circuit", "--no-figures --track circle --test-tracks circle")
 
 
 @pytest.fixture(scope="session")
