@@ -1,4 +1,4 @@
-"""Seconds of learning until an agent earns what the paper's does, without a crash.
+"""Seconds of learning until an agent earns what the paper's does, and crashes no more.
 
 Each budget of steps is a run of its own, whose schedules end with it; compilation and evaluation
 do not count. The threat function is that of --threat, or is learned first, and timed too.
@@ -21,6 +21,7 @@ from benchmarks.report import machine
 from experiments import cli, console, pipeline, reconnaissance, tables, tasks
 from experiments.paper import published
 from experiments.paper.scores import RP
+from experiments.paper.section import HALF_A_DIGIT
 from experiments.runs import EXPERIMENTS
 from rp_jax import storage
 from rp_jax.validate import number, one_of
@@ -85,12 +86,13 @@ def run(config: Config, settings: Any, task: tasks.Task) -> dict[str, Any]:
 
 def show(found: dict[str, Any], env: str) -> None:
     """A line per budget, and the first of them that all seeds pass with."""
-    wanted, lines, passed = published.SCORES[env][LEARNED_ON[env]][RP][0], [], []
+    (wanted, rate), lines, passed = published.SCORES[env][LEARNED_ON[env]][RP], [], []
+    most = rate + HALF_A_DIGIT  # it was rounded
     for budget in dict.fromkeys(row["budget"] for row in found["rows"]):
         rows = [row for row in found["rows"] if row["budget"] == budget]
         (total,) = tables.over_seeds(rows)
         seconds = float(np.median([row["seconds"] for row in rows]))
-        past = sum(row["return_mean"] > wanted and not row["crashes"] for row in rows)
+        past = sum(row["return_mean"] > wanted and row["crash_rate"] < most for row in rows)
         if past == len(rows):
             passed.append(f"{seconds:.1f} s ({budget:,} steps)")
         lines.append(
@@ -103,7 +105,8 @@ def show(found: dict[str, Any], env: str) -> None:
                 "past": f"{past} of {len(rows)}",
             }
         )
-    console.table(f"{env}: past {wanted:g} without a crash", lines, list(lines[0]))
+    title = f"{env}: past {wanted:g}, and less than {100 * most:g} % crashes"
+    console.table(title, lines, list(lines[0]))
     console.say(f"all seeds past it: {passed[0] if passed else 'with none of these budgets'}")
     if found["threat_seconds"] is not None:
         console.say(f"threat function: {found['threat_seconds']:.1f} s, compilation included")
