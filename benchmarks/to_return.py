@@ -36,7 +36,9 @@ class Config:
     env: str = "circuit"  # or jam
     baseline: str = "paper"  # or plans
     threat: Path | None = None  # folder of a threat function to use
-    budgets: tuple[int, ...] = (100_000, 200_000, 400_000, 600_000, 900_000)  # agent steps
+    budgets: tuple[int, ...] = (100_000, 150_000, 200_000, 300_000, 400_000)  # agent steps
+    num_envs: int = 32  # side by side; the fewer, the more often a step is learned from
+    batch: int = 128  # transitions replayed at once
     seeds: int = 3  # runs for each, one after another
     episodes: int = 1000  # evaluated each
     out: Path | None = None  # JSON file
@@ -50,8 +52,10 @@ def prepare(config: Config) -> tuple[Any, tasks.Task]:
     """
     module = EXPERIMENTS[one_of("env", config.env, LEARNED_ON)]
     number("seeds", config.seeds, least=1, integer=True)
+    quick = module.quick("tuned")
     settings = dataclasses.replace(
-        module.quick("tuned"),
+        quick,
+        planning=dataclasses.replace(quick.planning, num_envs=config.num_envs, batch=config.batch),
         baseline=config.baseline,
         threat=config.threat,
         episodes=config.episodes,
