@@ -87,7 +87,7 @@ def sum_reports(
                 key, states.agent, hazards[kind], subs[kind], estimator, checkpoints.at(kind)
             )
             only = {kind: models[kind]}
-            said = total_threat(only, states.agent, {kind: hazards[kind]})
+            said = jax.jit(total_threat)(only, states.agent, {kind: hazards[kind]})
             bar("", 1, 1)
         found[kind] = report.compare(np.asarray(said), true, config.x)
     return found

@@ -3,6 +3,7 @@
 A start is drawn as features, from which the hazard source restores the states.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -13,6 +14,7 @@ from jax import Array
 from rp_jax.hazards import SubRMDP
 
 
+@functools.partial(jax.jit, static_argnames="count")
 def uniform(key: Array, sub: SubRMDP, count: int) -> Array:
     """(count, F) features, spread over the window and all speeds."""
 

@@ -1,6 +1,7 @@
 """Algorithm 2, lines 1 and 2: labels, fit and report of one sub-R-MDP's threat function."""
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -62,8 +63,18 @@ class Built(NamedTuple):
     seconds: dict[str, float]  # labels, fit, report
 
 
+# Compiled whole: one by one, their operations would take a minute to compile.
+_states = jax.jit(lambda sub, features: jax.vmap(sub.source.state_of)(features))
+_preferential = jax.jit(sampling.preferential, static_argnames="count")
+_split = jax.jit(fit.split, static_argnames="share")
+_init = jax.jit(fit.init, static_argnames="config")
+_run = jax.jit(fit.run, static_argnames=("config", "steps"), donate_argnames="state")
+_logits = jax.jit(ThreatModel.logits)
+_predict = jax.jit(report.predict)
+
+
 def _labelled(key, features, sub, estimator, stage, on_progress, mesh, checkpoints) -> Dataset:
-    agent, hazard = jax.vmap(sub.source.state_of)(features)
+    agent, hazard = _states(sub, features)
     watch = (lambda done, total: on_progress(stage, done, total)) if on_progress else None
     at = checkpoints.at(stage)
     found = labels.label(
@@ -72,7 +83,12 @@ def _labelled(key, features, sub, estimator, stage, on_progress, mesh, checkpoin
     return Dataset(features, found.threat)
 
 
-_run = jax.jit(fit.run, static_argnames=("config", "steps"), donate_argnames="state")
+@jax.jit
+def _validated(model: ThreatModel, params: Any, held: Dataset) -> tuple[Array, Array]:
+    """Cross entropy and mean absolute error."""
+    logits = model.replace(params=params).logits(held.features)
+    error = jnp.mean(jnp.abs(jax.nn.sigmoid(logits) - held.threat))
+    return fit.cross_entropy(logits, held.threat), error
 
 
 def fitted(
@@ -94,9 +110,9 @@ def fitted(
     config.validate("config")
     leading(features=data.features, threat=data.threat)
     split_key, init_key = jax.random.split(key)
-    train, held = fit.split(split_key, data, config.validation)
+    train, held = _split(split_key, data, share=config.validation)
     train = fit.mirror(train, sub)
-    model, state = fit.init(init_key, sub, train, config)
+    model, state = _init(init_key, sub, train, config=config)
     length = max(1, config.steps // chunks)
     config = dataclasses.replace(config, steps=length * chunks)
 
@@ -104,10 +120,7 @@ def fitted(
         state, losses = _run(model, carried[0], train, config=config, steps=length)
         finite("fit: losses", losses)
         finite("fit: weights", np.concatenate([np.ravel(a) for a in jax.tree.leaves(state.params)]))
-        logits = model.replace(params=state.params).logits(held.features)
-        error = jnp.mean(jnp.abs(jax.nn.sigmoid(logits) - held.threat))
-        validation_loss = fit.cross_entropy(logits, held.threat)
-        carried[1][i] = [jnp.mean(losses), validation_loss, error]
+        carried[1][i] = [np.mean(losses), *_validated(model, state.params, held)]
         if on_progress:
             on_progress("fit", (i + 1) * length, config.steps)
         return state, carried[1]
@@ -158,7 +171,7 @@ def calibrated(
     if n == 0 or not 0 < x < 1:
         return model, Calibration(1.0, confidence, len(unsafe), n, 0)
     knee = np.log(x / (1 - x))
-    short = np.where(unsafe, knee - np.asarray(model.logits(data.features)), -np.inf)
+    short = np.where(unsafe, knee - np.asarray(_logits(model, data.features)), -np.inf)
     needed = np.sort(short.max(axis=1)[counted])[::-1]
     allowed = max(0, statistics.events_allowed(n, rate, confidence))
     shift = max(0.0, float(needed[allowed]) + 1e-4)
@@ -173,10 +186,19 @@ def near_threshold(key: Array, sub: SubRMDP, model: ThreatModel, x: float, most:
 
     Drawn uniformly and kept with the probability that `sampling.interest` says.
     """
+    pool, kept = _thinned(key, sub, model, x, 20 * most)
+    return jnp.asarray(np.asarray(pool)[np.flatnonzero(kept)[:most]])
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def _thinned(
+    key: Array, sub: SubRMDP, model: ThreatModel, x: float, count: int
+) -> tuple[Array, Array]:
+    """(features, whether they are kept)."""
     draw_key, keep_key = jax.random.split(key)
-    pool = sampling.uniform(draw_key, sub, 20 * most)
+    pool = sampling.uniform(draw_key, sub, count)
     odds = jnp.minimum(sampling.interest(model(pool), x), 1.0)
-    return pool[np.flatnonzero(jax.random.bernoulli(keep_key, odds))[:most]]
+    return pool, jax.random.bernoulli(keep_key, odds)
 
 
 def build(
@@ -218,8 +240,8 @@ def build(
     if config.sampling == "preferential":
         short = dataclasses.replace(config.fit, steps=max(1, config.fit.steps // 4))
         scout, _ = fitted(keys[2], sub, data, short, on_progress, checkpoints=at("scout"))
-        more = sampling.preferential(
-            keys[3], sub, scout, data.features, data.threat, x, config.states - first
+        more = _preferential(
+            keys[3], sub, scout, data.features, data.threat, x, count=config.states - first
         )
         extra = _labelled(
             keys[4], more, sub, estimator, "more labels", on_progress, mesh, checkpoints
@@ -241,7 +263,7 @@ def build(
     fresh_key, test_key = jax.random.split(keys[7])
     fresh = sampling.uniform(fresh_key, sub, config.test_states)
     test = _labelled(test_key, fresh, sub, accurate, "report", on_progress, mesh, checkpoints)
-    found = report.compare(np.asarray(report.predict(model, fresh)), np.asarray(test.threat), x)
+    found = report.compare(np.asarray(_predict(model, fresh)), np.asarray(test.threat), x)
     seconds = {
         "labels": labelled - began,
         "fit": fitted_at - labelled,

@@ -100,7 +100,7 @@ def test_states_near_the_threshold_are_drawn_where_threat_is_near_it():
     def model(features):
         return jnp.tile(jnp.exp(-8 * jnp.linalg.norm(features[:, :2], axis=-1))[:, None], (1, 15))
 
-    near = build.near_threshold(jax.random.key(3), SUB, model, 0.01, 500)
+    near = build.near_threshold(jax.random.key(3), SUB, jax.tree_util.Partial(model), 0.01, 500)
     anywhere = sampling.uniform(jax.random.key(4), SUB, 500)
     gap = [np.abs(np.log(np.asarray(model(f))[:, 0] / 0.01)).mean() for f in (near, anywhere)]
     assert gap[0] < 0.9 * gap[1]
