@@ -41,6 +41,7 @@ def tell(results: dict[str, Any]) -> Section:
         reached = f"together {minutes:.1f} minutes{met}"
     return Section(
         f"Wanted were threat functions and ten seeds of both tasks within {MINUTES:g} minutes; "
-        f"{reached}. Circuit under plans, whose threat of walls needs no learning.",
+        f"{reached}. Circuit under plans, whose threat of walls needs no learning; with 32 "
+        "environments side by side.",
         tables=[*tables, Table("Learning, wall time", lines)],
     )
