@@ -55,19 +55,20 @@ COMMANDS: dict[str, str] = {
 }
 
 _FIT = "--{0}.fit.steps 2000 --{0}.test-states 500 --{0}.test-paths 1024"
+_SMALL = "--planning.num-envs 32 --planning.batch 128"  # batches: more is learned from a step
 _FEW, _MORE = (f"--steps {steps} --episodes 1000" for steps in (200_000, 600_000))
 SIZES: dict[str, dict[str, str]] = {
     "full": {
         "frozen_lake": "",
         "instances": "200000",
         "seeds": "--preset full --episodes 10000",
-        "brief": "--preset full --episodes 2000",
+        "brief": f"--preset full --episodes 2000 {_SMALL}",
         "few": "--preset full --seeds 3 --episodes 4000",
         "episodes": "--preset full --episodes 10000",
         "circuit_steps": "",
         "jam_steps": "",
-        "circuit_brief": "--planning.steps 300000 --planning.num-envs 32 --planning.batch 128",
-        "jam_brief": "--planning.steps 100000 --planning.num-envs 32 --planning.batch 128",
+        "circuit_brief": "--planning.steps 300000",
+        "jam_brief": "--planning.steps 100000",
         "gather_steps": "",
         "paper_steps": "",
         "wall": "",
@@ -89,13 +90,13 @@ SIZES: dict[str, dict[str, str]] = {
         "frozen_lake": "--horizons 100 --no-program",
         "instances": "2000",
         "seeds": "--episodes 1000",
-        "brief": "--episodes 1000",
+        "brief": f"--episodes 1000 {_SMALL}",
         "few": "--episodes 1000",
         "episodes": "--episodes 1000",
         "circuit_steps": "--planning.steps 200000",
         "jam_steps": "--planning.steps 200000",
-        "circuit_brief": "--planning.steps 100000 --planning.num-envs 32 --planning.batch 128",
-        "jam_brief": "--planning.steps 50000 --planning.num-envs 32 --planning.batch 128",
+        "circuit_brief": "--planning.steps 100000",
+        "jam_brief": "--planning.steps 50000",
         "gather_steps": "--planning.steps 200000",
         "paper_steps": "--planning.steps 20000",
         "wall": "--wall.states 20000 " + _FIT.format("wall"),

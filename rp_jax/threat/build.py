@@ -70,7 +70,6 @@ _split = jax.jit(fit.split, static_argnames="share")
 _init = jax.jit(fit.init, static_argnames="config")
 _run = jax.jit(fit.run, static_argnames=("config", "steps"), donate_argnames="state")
 _logits = jax.jit(ThreatModel.logits)
-_predict = jax.jit(report.predict)
 
 
 def _labelled(key, features, sub, estimator, stage, on_progress, mesh, checkpoints) -> Dataset:
@@ -263,7 +262,7 @@ def build(
     fresh_key, test_key = jax.random.split(keys[7])
     fresh = sampling.uniform(fresh_key, sub, config.test_states)
     test = _labelled(test_key, fresh, sub, accurate, "report", on_progress, mesh, checkpoints)
-    found = report.compare(np.asarray(_predict(model, fresh)), np.asarray(test.threat), x)
+    found = report.compare(np.asarray(report.predict(model, fresh)), np.asarray(test.threat), x)
     seconds = {
         "labels": labelled - began,
         "fit": fitted_at - labelled,

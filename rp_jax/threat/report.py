@@ -47,6 +47,7 @@ def compare(predicted: np.ndarray, true: np.ndarray, x: float) -> dict[str, floa
     }
 
 
+@jax.jit
 def predict(model: ThreatModel, features: Array) -> Array:
     """(n, A) threats of features (n, F); 0 for what is out of reach, as `total_threat` has it."""
     reached = jax.vmap(lambda row: model.source.in_reach(*model.source.state_of(row)))(features)

@@ -35,22 +35,23 @@ def test_the_page_shows_the_code_that_is_tested():
 
 
 @pytest.mark.parametrize(
-    ("module", "kinds", "test"),
+    ("module", "kinds", "options", "variants"),
     [
-        (crossing, ["pedestrian", "parked"], "--test-pedestrians 6"),
-        (trolley, ["cart"], "--test-carts 6"),
+        (crossing, ["pedestrian", "parked"], "", 2),
+        (trolley, ["cart"], "--test-carts 6", 1),  # minutes to compile each
     ],
 )
 @pytest.mark.slow
-def test_a_world_of_ones_own_goes_all_the_way(module, kinds, test, tmp_path):
+def test_a_world_of_ones_own_goes_all_the_way(module, kinds, options, variants, tmp_path):
     out = tmp_path / "results"
-    argv = " ".join([TINY, "--seeds 1", test, *map(TINY_THREAT.format, kinds)]).split()
+    argv = " ".join([TINY, "--seeds 1", options, *map(TINY_THREAT.format, kinds)]).split()
     name, about = module.__name__, module.__doc__
     presets, make = {"quick": module.quick}, module.make_task
     with moment():
         cli.main(name, about, presets, make, [*argv, "--out", str(out)], ablation.run)
     rows = json.loads((out / "table.json").read_text())
-    assert len(rows) == 5  # at random twice, two DQNs, RP
+    assert len({row["variant"] for row in rows}) == variants
+    assert len(rows) == variants * 5  # at random twice, two DQNs, RP
     assert {row["x"] for row in rows} == {"inf", 0.9}
     assert all(set(row["causes"]) == set(kinds) for row in rows)
     assert (out / "learning_curves.png").stat().st_size > 1000
