@@ -45,7 +45,7 @@ def row(name: str, sub: SubRMDP, estimator: labels.Estimator, batch: int) -> Row
 
     def made(count: int) -> tuple[Any, ...]:
         features = sampling.uniform(key, sub, count)
-        return (key, *jax.vmap(sub.source.state_of)(features), sub)
+        return (key, *sampling.states(sub, features), sub)
 
     side = min(batch, ROWS)
     piece = Piece(program, made(side), batch / side)
@@ -58,7 +58,7 @@ def paths_needed(sub: SubRMDP, estimator: labels.Estimator, error: float, states
     Over states spread over the window and all actions; it falls with the root of the paths.
     """
     key = jax.random.key(1)
-    agent, hazard = jax.vmap(sub.source.state_of)(sampling.uniform(key, sub, states))
+    agent, hazard = sampling.states(sub, sampling.uniform(key, sub, states))
     found = labels.label(key, agent, hazard, sub, estimator)
     return PATHS * float(jnp.mean(jnp.square(found.stderr))) / error**2
 

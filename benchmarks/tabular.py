@@ -28,8 +28,9 @@ def solved(cmdp: FiniteCMDP) -> jax.Array:
 
 def drawn(key: jax.Array, horizon: int = HORIZON) -> FiniteCMDP:
     """A random CMDP with rewards."""
+    key, reward_key = jax.random.split(key)
     cmdp = verify.draw(key, STATES, ACTIONS, horizon).cmdp
-    reward = jax.random.uniform(jax.random.fold_in(key, 1), cmdp.danger.shape)
+    reward = jax.random.uniform(reward_key, cmdp.danger.shape)
     return cmdp.replace(reward=reward)
 
 

@@ -1,6 +1,6 @@
 """The same learner without a shield, without one but penalised, and with it, from one program."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from experiments import cli, console, pipeline, reconnaissance, tables, tasks, training
-from rp_jax import evaluate, storage
+from rp_jax import evaluate, shield, storage
 from rp_jax.checkpoints import Checkpoints
+from rp_jax.validate import number, one_of
 
 RANDOM = 100  # stream of random numbers, apart from the pipeline's
 
@@ -40,7 +41,7 @@ def at_random(
     for variant, params in task.tests.items():
         for x in (float("inf"), config.x):
             pmdp = tasks.make_pmdp(task, config, models, params)
-            episodes = play(pmdp.replace(x=jnp.float32(x)))
+            episodes = play(pmdp.replace(x=jnp.asarray(shield.rounded_down(x))))
             method = "random" if x == float("inf") else f"random, shield (x={x:g})"
             evaluate.check(episodes, method)
             found = evaluate.summarise(episodes, config.penalty)
@@ -64,12 +65,28 @@ def show(name: str, rows: Sequence[Mapping[str, Any]]) -> None:
     console.table(name, shown, list(shown[0]))
 
 
+def main(
+    name: str,
+    about: str,
+    presets: Mapping[str, Callable[[str], Any]],
+    make_task: Callable[[Any], tasks.Task],
+    argv: Sequence[str] | None = None,
+) -> Path:
+    """The comparison from the command line; arguments are those of `cli.main`."""
+
+    def checked(config: tasks.Config) -> tasks.Task:
+        number("x", config.x, least=0)  # finite: there is a shield to compare
+        number("learning_penalty", config.learning_penalty, least=0, most=0)  # it is `penalty`
+        one_of("learning_penalty_from", config.learning_penalty_from, [None])
+        return make_task(config)
+
+    return cli.main(name, about, presets, checked, argv, run)
+
+
 def run(task: tasks.Task, config: tasks.Config, folder: Path, checkpoints: Checkpoints) -> None:
     """The comparison, into a prepared folder: table.json and learning_curves.png."""
     models, _, _ = reconnaissance.learn_threats(task, config, folder, checkpoints)
-    if models is None:
-        with cli.bad_input():
-            raise ValueError("x is inf; it must be finite where the shield is to be compared")
+    assert models is not None  # x is finite
     pmdp, members = tasks.make_pmdp(task, config, models, task.train), members_of(config)
     trained, found = pipeline.plan_and_evaluate(task, config, pmdp, members, folder, checkpoints)
     rows = at_random(task, config, models) + found

@@ -84,7 +84,7 @@ def begun(config: Config) -> tuple[str, Path]:
     if config.resume is None:
         preset = one_of("preset", config.preset or "quick", SIZES)
         folder = storage.new_folder(config.out or pipeline.default_out("paper", preset))
-        plain = {"experiment": NAME, "preset": preset, **settings.machine()}
+        plain = {"experiment": NAME, "preset": preset, **settings.machine(NAME)}
         storage.write_json(folder / "config.json", plain)
         return preset, folder
     if config.preset or config.out:
@@ -157,7 +157,7 @@ def blocks(folder: Path, preset: str, failed: dict[str, str]) -> list[report.Blo
     claims = [claim for section in told.values() for claim in section.claims]
     counts = Counter(claim.verdict.partition(" (")[0] for claim in claims)
     missing = [name for name in RESULTS if name not in told and name not in failed]
-    machine = settings.machine()
+    machine = settings.machine(NAME)
     versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
     out: list[report.Block] = [
         report.Heading("The paper's figures and tables, and more", 1),
@@ -166,7 +166,7 @@ def blocks(folder: Path, preset: str, failed: dict[str, str]) -> list[report.Blo
         "pooled; returns, Student's over seeds, or over episodes where there is one seed.",
         f"{len(claims)} verdicts: "
         + "; ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
-        + ". There is one for each kind of RP where a published entry is of RP. Several seeds "
+        + ". Where the paper has a number of RP, each kind of RP here has a verdict. Several seeds "
         "have exceeded a published return if their whole interval lies above it; a return is "
         "reproduced if the mean reaches it, or the interval does and the mean falls short by at "
         f"most {100 * CLOSE:g} %. A crash rate reproduces the published one, which has two "

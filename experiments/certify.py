@@ -17,10 +17,9 @@ import tyro
 
 import rp_jax
 from experiments import cli, console, runs, tasks
+from experiments.evaluation import ROUND
 from rp_jax import evaluate, statistics, storage
 from rp_jax.validate import number
-
-ROUND = 1000  # episodes side by side
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from experiments import cli, pipeline, recipes, tasks
 from rp_jax.envs import circuit
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.threat.build import ThreatConfig
-from rp_jax.validate import number
+from rp_jax.validate import number, within
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,13 @@ def make_task(config: Config) -> tasks.Task:
         elsewhere = not np.array_equal(found.track.centre, train.track.centre)
         return found.replace(lost=jax.numpy.asarray(elsewhere and config.lost > 0, float))
 
+    with within("test_tracks"):
+        tests = {track: test(track) for track in config.test_tracks}
     return tasks.Task(
         name="circuit",
         env=circuit,
         train=train,
-        tests={track: test(track) for track in config.test_tracks},
+        tests=tests,
         threats={"wall": config.wall},
         draw=draw,
     )

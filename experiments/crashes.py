@@ -19,11 +19,10 @@ import numpy as np
 import tyro
 
 from experiments import cli, console, runs, tasks
+from experiments.evaluation import ROUND
 from rp_jax import evaluate, rare, statistics, storage
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import finite, number
-
-ROUND = 1000  # episodes side by side
 
 
 @dataclass(frozen=True, kw_only=True)

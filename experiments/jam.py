@@ -14,6 +14,7 @@ from rp_jax.envs import jam
 from rp_jax.kinematics import Vehicle
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.threat.build import ThreatConfig
+from rp_jax.validate import within
 
 
 @dataclass(frozen=True)
@@ -63,11 +64,14 @@ def make_task(config: Config) -> tasks.Task:
             baseline=config.baseline,
         )
 
+    train = params(config.obstacles, config.fewest_obstacles)
+    with within("test_obstacles"):
+        tests = {f"N={n}": params(n) for n in config.test_obstacles}
     return tasks.Task(
         name="jam",
         env=jam,
-        train=params(config.obstacles, config.fewest_obstacles),
-        tests={f"N={n}": params(n) for n in config.test_obstacles},
+        train=train,
+        tests=tests,
         threats={"wall": config.wall, "obstacle": config.obstacle},
         draw=draw,
     )

@@ -5,7 +5,7 @@ Patrolling between two corners: no shield; no shield, but danger penalised; the 
 python -m experiments.patrol --threat results/RUN/threat
 """
 
-from experiments import ablation, cli, jam, tasks
+from experiments import ablation, jam, tasks
 from rp_jax.envs import patrol
 
 
@@ -15,4 +15,4 @@ def make_task(config: jam.Config) -> tasks.Task:
 
 
 if __name__ == "__main__":
-    cli.main("experiments.patrol", __doc__ or "", jam.PRESETS, make_task, run=ablation.run)
+    ablation.main("experiments.patrol", __doc__ or "", jam.PRESETS, make_task)

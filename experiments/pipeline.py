@@ -12,8 +12,10 @@ from experiments.training import Member, Trained
 from rp_jax import devices, storage
 from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
 from rp_jax.planning import loop
+from rp_jax.planning.networks import POOLS
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.threat import artefact
+from rp_jax.validate import one_of
 
 
 class Finished(NamedTuple):
@@ -45,10 +47,18 @@ def checked(make_task: Callable[[Any], tasks.Task], config: tasks.Config) -> tas
     devices.connect(config.devices)
     devices.divides("seeds", config.seeds, devices.mesh_of(config.devices))
     task = make_task(config)
+    if not task.tests:
+        raise ValueError("tests is {}; the task must name at least one variant to be tested in")
+    subs = task.env.sub_rmdps(task.train)
+    for kind in subs:
+        one_of(f"kind of hazard of {task.name}", kind, task.threats)
     for kind, threat in task.threats.items():
         threat.validate(kind)
+    pool, bins = POOLS[config.planning.network], task.env.LIDAR_BINS
+    if bins % pool:
+        raise ValueError(f"LIDAR_BINS is {bins}; it must be a multiple of {pool}")
     if config.threat is not None:
-        artefact.load(config.threat, task.name, task.env.sub_rmdps(task.train))
+        artefact.load(config.threat, task.name, subs)
     return task
 
 

@@ -14,7 +14,7 @@ from rp_jax.envs import point_gather
 from rp_jax.kinematics import Vehicle
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.threat.build import ThreatConfig
-from rp_jax.validate import one_of
+from rp_jax.validate import one_of, within
 
 ROOMS = 6  # in the figure of trajectories
 
@@ -57,11 +57,14 @@ def make_task(config: Config) -> tasks.Task:
             config.apples, bombs, horizon=config.horizon, fidelity=config.fidelity
         )
 
+    train = params(config.bombs)
+    with within("test_bombs"):
+        tests = {f"{n} bombs": params(n) for n in config.test_bombs}
     return tasks.Task(
         name="point_gather",
         env=point_gather,
-        train=params(config.bombs),
-        tests={f"{n} bombs": params(n) for n in config.test_bombs},
+        train=train,
+        tests=tests,
         threats={"bomb": config.bomb},
         draw=draw,
     )

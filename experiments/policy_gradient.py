@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import console, evaluation, tasks, training
-from rp_jax import evaluate
+from rp_jax import evaluate, storage
 from rp_jax.baselines import actor_critic, cpo, pid_lagrangian
 from rp_jax.checkpoints import Checkpoints
 from rp_jax.planning.pmdp import PMDP
@@ -32,13 +32,15 @@ class Method(NamedTuple):
 def learn(
     method: Method, pmdp: PMDP, config: Any, folder: Path, checkpoints: Checkpoints
 ) -> evaluation.Agents:
-    """Trains all seeds as one program; writes metrics.jsonl as it goes. They act by their modes.
+    """Trains all seeds as one program; writes metrics.jsonl as it goes, then the actors.
+
+    They act by their modes.
 
     Args:
         method: what learns.
         pmdp: without threats; its penalty is taken off the rewards.
         config: the task's settings.
-        folder: for metrics.jsonl, created if missing.
+        folder: for metrics.jsonl and the actors, created if missing.
         checkpoints: of the learning.
 
     Raises:
@@ -100,6 +102,8 @@ def learn(
             bar,
             checkpoints,
         )
+    about = {"method": name, "limit": limit, "members": [member._asdict() for member in members]}
+    storage.save(folder / "agent", "actor", params, about)
     trained = training.Trained(params, rows, seconds, compiled - began)
     return evaluation.Agents(members, names, modes(learning, pmdp), trained)
 

@@ -83,6 +83,8 @@ def load(folder: Path) -> Run:
     """
     folder = Path(folder)
     path, plain = folder / "config.json", settings.read(folder)
+    names = [f"experiments.{name}" for name in EXPERIMENTS]
+    one_of(f"{path}: experiment", str(plain.get("experiment")), names)
     module = EXPERIMENTS[one_of(f"{path}: task", str(plain.get("task")), EXPERIMENTS)]
     config = settings.restored(module.Config, plain, str(path))
     config.validate()

@@ -34,6 +34,8 @@ class Config:
 
     def validate(self) -> None:
         """Raises ValueError, naming the field, if a value is out of range."""
+        if not self.sizes:
+            raise ValueError("sizes is (); it must name at least one number of states")
         for size in self.sizes:
             number("sizes", size, least=1000, integer=True)
         number("repeats", self.repeats, least=1, integer=True)
@@ -57,7 +59,7 @@ def test_sets(key: jax.Array, sub: SubRMDP, config: Config, x: float) -> dict[st
 
 def _label(key: jax.Array, sub: SubRMDP, features: jax.Array, paths: int) -> jax.Array:
     estimator = labels.best_estimator(sub, paths)
-    agent, hazard = jax.vmap(sub.source.state_of)(features)
+    agent, hazard = sampling.states(sub, features)
     return labels.label(key, agent, hazard, sub, estimator).threat
 
 
@@ -128,7 +130,8 @@ def main() -> None:
         config.validate()
         cli.needs_matplotlib(True)
         folder = storage.new_folder(config.out)
-    rows = run(config)
+    with cli.bad_input():
+        rows = run(config)
     storage.write_json(folder / "sampling.json", {"settings": config.__dict__, "rows": rows})
     plot(rows, folder / "sampling.png")
     console.say(f"results: {folder}")

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import hashlib
+import importlib.util
 import json
 import os
 import types
@@ -24,22 +25,33 @@ FLAGS = ("XLA_FLAGS", "JAX_DEFAULT_MATMUL_PRECISION", "JAX_ENABLE_X64")  # they 
 DRAWN = ("all.py", "console.py", "drawing.py", "report.py")  # nothing is computed there
 
 
-def machine() -> dict[str, Any]:
-    """What must not change for a run to be resumed to the same bits."""
+def machine(experiment: str) -> dict[str, Any]:
+    """What must not change for a run of an experiment to be resumed to the same bits."""
     return {
         "versions": {"rp_jax": rp_jax.__version__, "jax": jax.__version__},
         "device": str(jax.devices()[0]),
         "flags": {name: os.environ.get(name, "") for name in FLAGS},
-        "code": code(),
+        "code": code(experiment),
     }
 
 
 @functools.cache
-def code() -> str:
-    """Checksum of the source that computes a run; what only draws or reports is not in it."""
+def code(experiment: str) -> str:
+    """Checksum of the source that computes a run; what only draws or reports is not in it.
+
+    Args:
+        experiment: name of its module. If that lives elsewhere, its folder belongs to it.
+    """
     here, library = Path(__file__).parent, Path(rp_jax.__file__).parent
+    files = [*sorted(library.glob("**/*.py")), *sorted(here.glob("*.py"))]
+    try:
+        found = importlib.util.find_spec(experiment)
+    except (ModuleNotFoundError, ValueError):  # of a package that is not there; of __main__
+        found = None
+    if found and found.origin and Path(found.origin).parent != here:
+        files += sorted(Path(found.origin).parent.glob("*.py"))
     digest = hashlib.sha256()
-    for file in (*sorted(library.glob("**/*.py")), *sorted(here.glob("*.py"))):
+    for file in files:
         if "plot" not in file.parts and file.name not in DRAWN:
             digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
@@ -48,7 +60,7 @@ def code() -> str:
 def begin(folder: Path, experiment: str, settings: Mapping[str, Any]) -> Checkpoints:
     """Writes config.json of a new run of an experiment."""
     (folder / CHECKPOINTS).mkdir()
-    plain = {"experiment": experiment, **settings, **machine()}
+    plain = {"experiment": experiment, **settings, **machine(experiment)}
     storage.write_json(folder / "config.json", plain)
     return checkpoints_of(folder)
 
@@ -87,7 +99,7 @@ def interrupted(folder: Path, experiment: str) -> dict[str, Any]:
             f"resume is {folder}; it must be an interrupted run, but there are no checkpoints: "
             "it is finished"
         )
-    for name, here in {"experiment": experiment, **machine()}.items():
+    for name, here in {"experiment": experiment, **machine(experiment)}.items():
         if settings.get(name) != here:
             raise ValueError(
                 f"resume is {folder}; its {name} is {settings.get(name)}; it must be {here} to "
@@ -100,11 +112,16 @@ def restored(kind: type, plain: Any, where: str) -> Any:
     """A dataclass from what `storage.write_json` made of it. Fields not there keep their default.
 
     Raises:
-        storage.StorageError: a value is not of its field's type.
+        storage.StorageError: a value is not of its field's type, or one without a default is not
+            there.
     """
     if not isinstance(plain, Mapping):
         raise storage.StorageError(f"{where}: it is {plain!r}; it must be a table")
     types_of = typing.get_type_hints(kind)
+    for field in dataclasses.fields(kind):
+        missing = field.default is field.default_factory is dataclasses.MISSING
+        if missing and field.name not in plain:
+            raise storage.StorageError(f"{where}: {field.name} is missing; it must be there")
     names = [f.name for f in dataclasses.fields(kind) if f.name in plain]
     return kind(**{n: _value(types_of[n], plain[n], f"{where}: {n}") for n in names})
 

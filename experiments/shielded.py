@@ -16,6 +16,7 @@ import numpy as np
 import tyro
 
 from experiments import cli, console, jam, pipeline, recipes, reconnaissance, tables, tasks
+from experiments.evaluation import ROUND
 from rp_jax import evaluate, storage
 from rp_jax.adapters import brax
 from rp_jax.envs.base import Env, select
@@ -24,7 +25,6 @@ from rp_jax.threat.build import ThreatConfig
 from rp_jax.validate import number
 
 EPISODES = 100  # stream of random numbers, apart from the pipeline's
-ROUND = 1000  # episodes side by side
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,8 @@ def main(argv: Sequence[str] | None = None) -> Path:
         out = config.out or pipeline.default_out("shielded", "jam")
         settings = dataclasses.replace(config.for_pipeline(), out=out)
         task, folder = pipeline.prepare(jam.make_task, settings, "shielded")
-    rows = compare(config, task, folder)
+    with cli.bad_input():
+        rows = compare(config, task, folder)
     show(rows)
     storage.write_json(folder / "config.json", dataclasses.asdict(config))
     storage.write_json(folder / "table.json", rows)

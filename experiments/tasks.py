@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.training import Member
-from rp_jax import devices
-from rp_jax.envs.base import BASELINES, Env
+from rp_jax import devices, shield
+from rp_jax.envs.base import BASELINES, FIDELITIES, Env
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.planning.networks import POOLS
 from rp_jax.planning.pmdp import PMDP
@@ -55,7 +55,7 @@ class Config:
         number("penalty", self.penalty, least=0)
         number("episodes", self.episodes, least=1, integer=True)
         one_of("devices", self.devices, devices.DEVICES)
-        one_of("fidelity", self.fidelity, ("released", "paper"))
+        one_of("fidelity", self.fidelity, FIDELITIES)
         one_of("baseline", self.baseline, BASELINES)
         number("lookahead", self.lookahead, least=0, most=10_000, integer=True)
         self.planning.validate("planning")
@@ -102,7 +102,7 @@ def make_pmdp(task: Task, config: Config, models: Mapping | None, params: Any) -
     return PMDP(
         params=params,
         threats=None if models is None else dict(models),
-        x=jnp.asarray(config.x, jnp.float32),
+        x=jnp.asarray(shield.rounded_down(config.x)),
         penalty=jnp.asarray(config.learning_penalty, jnp.float32),
         toll=jnp.asarray(config.learning_toll, jnp.float32),
         env=task.env,
@@ -113,6 +113,7 @@ def make_pmdp(task: Task, config: Config, models: Mapping | None, params: Any) -
 
 def side_by_side(pmdp: PMDP, members: Sequence[Member]) -> tuple[PMDP, PMDP]:
     """The P-MDPs of all members, and the `in_axes` of a vmap over them."""
-    x, penalty = (jnp.asarray(v, jnp.float32) for v in zip(*(m[1:] for m in members), strict=True))
+    x = jnp.asarray(shield.rounded_down([member.x for member in members]))
+    penalty = jnp.asarray([member.learning_penalty for member in members], jnp.float32)
     axes = pmdp.replace(params=None, threats=None, x=0, penalty=0, toll=None)
     return pmdp.replace(x=x, penalty=penalty), axes

@@ -3,6 +3,7 @@
 python -m experiments.truth --env jam --threat results/RUN/threat
 """
 
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,8 +44,11 @@ def features_of(states: np.ndarray) -> Array:
 
 def compare(model: ThreatModel, recorded: Path, x: float) -> dict[str, dict[str, float]]:
     """Errors on each set of states in a file of recorded threats; sets end alike, as in `_near`."""
-    with np.load(recorded) as file:
-        data = dict(file)
+    try:
+        with np.load(recorded) as file:
+            data = dict(file)
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"data: {recorded} cannot be read ({error}); it must be there") from error
     found = {}
     for name in ("states", "states_near"):
         if name in data:

@@ -79,7 +79,11 @@ def run_episodes(
 def play_episodes(
     key: Array, pmdp: PMDP, policy: Policy, episodes: int, *, batch: int = 1000
 ) -> Episodes:
-    """`run_episodes` of any policy, also of a random one or one with continuous actions."""
+    """`run_episodes` of any policy, also of a random one or one with continuous actions.
+
+    Raises:
+        ValueError: a count is not above 0.
+    """
     random_key("key", key)
     number("episodes", episodes, least=1, integer=True)
     number("batch", batch, least=1, integer=True)

@@ -107,6 +107,11 @@ class Window(struct.PyTreeNode):
         outside = (x < self.lower[0]) | (x > self.upper[0])
         return ~(outside | (y < self.lower[1]) | (y > self.upper[1]))
 
+    @property
+    def farthest(self) -> float:
+        """Distance of its farthest corner from the agent."""
+        return float(np.hypot(*np.maximum(np.abs(np.asarray(self.lower)), np.asarray(self.upper))))
+
     def sample(self, key: Array) -> Array:
         """(2,) a relative position, uniform over the box."""
         return jax.random.uniform(key, (2,), self.lower.dtype, self.lower, self.upper)

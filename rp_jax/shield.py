@@ -3,7 +3,7 @@
 Primitives are unbatched: threats and values are (A,), masks (A,) bool.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,24 +39,24 @@ def shield(threat: Array, x: Array | float) -> Shield:
     return Shield(admissible=jnp.where(secure, allowed, fallback), secure=secure)
 
 
-def in_single_precision(threat: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Threats rounded up to float32 and thresholds rounded down.
+def rounded_down(x: Any) -> np.ndarray:
+    """Thresholds, float64 of any shape, as float32 that are nowhere greater.
 
-    So that no action is admissible in float32 that is not in float64: T <= x holds whenever it
-    holds for the rounded ones.
-
-    Args:
-        threat: float64, any shape.
-        x: float64, any shape.
+    So no action is admissible in float32 that is not in float64: T <= x holds wherever it holds
+    for the rounded x and for T, `rounded_up`.
     """
-    threat, x = np.asarray(threat, np.float64), np.asarray(x, np.float64)
-    above, below = threat.astype(np.float32), x.astype(np.float32)
+    return -rounded_up(-np.asarray(x, np.float64))
+
+
+def rounded_up(threat: Any) -> np.ndarray:
+    """Threats, float64 of any shape, as float32 that are nowhere less."""
+    threat = np.asarray(threat, np.float64)
+    with np.errstate(over="ignore"):  # infinity is what is above the largest number
+        above = threat.astype(np.float32)
     above = np.where(above < threat, np.nextafter(above, np.float32(np.inf)), above)
-    below = np.where(below > x, np.nextafter(below, np.float32(-np.inf)), below)
     # The smallest numbers are flushed to 0 by compiled code.
     tiny = np.finfo(np.float32).tiny
-    above = np.where((above > 0) & (above < tiny), tiny, above)
-    return above, np.where((below < 0) & (below > -tiny), -tiny, below)
+    return np.where((above > 0) & (above < tiny), tiny, above)
 
 
 def greedy_eta(threat: Array) -> Array:

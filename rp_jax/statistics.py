@@ -3,7 +3,7 @@
 import numpy as np
 from scipy import stats
 
-from rp_jax.validate import number
+from rp_jax.validate import MOST, number
 
 
 def clopper_pearson(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -42,7 +42,7 @@ def plan_test(c: float, confidence: float, expected: float, power: float) -> tup
         (n, k): k or fewer events in n trials show it.
 
     Raises:
-        ValueError: a value is out of range.
+        ValueError: a value is out of range, or more than `MOST` trials are needed.
     """
     _check_confidence(confidence)
     number("c", c, above=0)
@@ -53,12 +53,20 @@ def plan_test(c: float, confidence: float, expected: float, power: float) -> tup
             f"expected is {expected!r}, c is {c!r} and power is {power!r}; they must keep "
             "0 <= expected < c < 1 and 0 < power < 1"
         )
-    k = 0
-    while True:
-        n = _trials(k, c, confidence)
-        if stats.binom.cdf(k, n, expected) >= power:
-            return n, k
-        k += 1
+
+    def power_of(k: int) -> float:
+        return stats.binom.cdf(k, _trials(k, c, confidence), expected)
+
+    low, high = -1, 0  # low is too few events, high may be
+    while power_of(high) < power:
+        low, high = high, 2 * high + 1
+        number("expected: episodes needed", _trials(high, c, confidence), most=MOST)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if power_of(middle) >= power else (middle, high)
+    # More events have more power, but for the last few, since trials come whole.
+    k = next(k for k in range(max(0, high - 10), high + 1) if power_of(k) >= power)
+    return _trials(k, c, confidence), k
 
 
 def _trials(k: int, c: float, confidence: float) -> int:

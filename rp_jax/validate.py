@@ -1,7 +1,8 @@
 """Checks of user input: every message names the field, the value and what is allowed."""
 
+import contextlib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any, TypeVar
 
 import jax
@@ -24,6 +25,15 @@ def one_of(field: str, value: T, allowed: Iterable[T]) -> T:
         listed = ", ".join(map(repr, choices))
         raise ValueError(f"{field} is {shown(value)}; it must be one of {listed}")
     return value
+
+
+@contextlib.contextmanager
+def within(option: str) -> Iterator[None]:
+    """A ValueError raised inside begins with the name of the option that a user knows."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{option}: {error}") from error
 
 
 def number(

@@ -136,7 +136,7 @@ arguments = st.sampled_from(sorted(ENVS, key=lambda env: env.__name__)).flatmap(
 
 
 def parameters(env, given):
-    named({*given, "track: half_width"}, lambda: env.make_params(**given))
+    named({*given, "track: half_width", "track: at centre point"}, lambda: env.make_params(**given))
 
 
 class TestParameters:
@@ -176,14 +176,15 @@ def drawn(pieces, end):
         plan = TrackPlan().straight(2.0).curve(1.0, 180)
         for name, *values in pieces:
             plan = getattr(plan, name)(*values)
-        return tracks.make_track(plan.straight(2.0).curve(1.0, 180) if end else plan, 0.1, 0.7)
+        plan = plan.straight(2.0).curve(1.0, 180) if end else plan
+        return tracks.make_track(plan, 0.1, 0.1, 0.7)
 
     named(("straight: ", "curve: ", "close: ", "track: "), call)
 
 
 def made(fields):
     plan = dataclasses.replace(tracks.circle_plan(), **fields)
-    named(("track: ",), lambda: tracks.make_track(plan, 0.1, 0.7))
+    named(("track: ",), lambda: tracks.make_track(plan, 0.1, 0.1, 0.7))
 
 
 class TestTracks:

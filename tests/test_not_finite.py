@@ -240,7 +240,7 @@ def fitted(monkeypatch, change=None, wrong=0.5):
         monkeypatch.setattr(build.fit, "optimiser", lambda _: change)
     config = FitConfig(hidden=(4,), steps=8, batch=64, validation=0.05)
     jax.clear_caches()  # of the fit with another optimiser
-    return build.fitted(jax.random.key(0), sub, data, config, chunks=2)
+    return build.fitted(jax.random.key(0), sub, data, config)
 
 
 @pytest.mark.parametrize("wrong", WRONG[:2])

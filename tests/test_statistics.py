@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from rp_jax.statistics import clopper_pearson, mean_interval, plan_test, upper_bound
+from rp_jax.statistics import _trials, clopper_pearson, mean_interval, plan_test, upper_bound
 
 rates = st.integers(1, 300).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
 
@@ -120,6 +120,22 @@ def test_a_planned_test_is_the_smallest_that_can_show_the_rate(c, confidence, ex
     if k > 0:  # fewer events allowed would fail an agent that shall pass
         fewer = next(m for m in range(k, n) if upper_bound(k - 1, m, confidence) <= c)
         assert stats.binom.cdf(k - 1, fewer, expected) < 0.9
+
+
+@given(st.floats(1e-3, 0.3), st.floats(0.8, 0.999), st.floats(0.0, 0.7), st.floats(0.5, 0.95))
+@settings(max_examples=30)
+def test_no_smaller_test_has_the_power(c, confidence, share, power):
+    _, k = plan_test(c, confidence, share * c, power)
+    for fewer in range(k):
+        assert stats.binom.cdf(fewer, _trials(fewer, c, confidence), share * c) < power
+
+
+def test_a_test_that_takes_millions_of_events_is_planned_at_once_or_refused():
+    n, k = plan_test(1e-3, 0.99, 9.9e-4, 0.9)
+    assert 1e8 < n < 2e9
+    assert k > 1e5
+    with pytest.raises(ValueError, match=r"^expected: episodes needed is .* at most 2e\+09"):
+        plan_test(1e-3, 0.99, 9.999e-4, 0.9)
 
 
 def test_no_event_in_2995_shows_less_than_a_thousandth():

@@ -6,10 +6,11 @@ python -m examples.crossing.run --out results/crossing
 from dataclasses import dataclass, field
 
 from examples.crossing import world
-from experiments import ablation, cli, tasks
+from experiments import ablation, tasks
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.threat.build import ThreatConfig
 from rp_jax.threat.fit import FitConfig
+from rp_jax.validate import one_of
 
 
 def model(states: int, paths: int = 64) -> ThreatConfig:
@@ -30,11 +31,14 @@ class Config(tasks.Config):
 
 def quick(recipe: str) -> Config:
     """A few minutes on two cores."""
+    one_of("recipe", recipe, ["tuned"])
     return Config(episodes=4_000, planning=LoopConfig(steps=300_000, num_envs=128, batch=512))
 
 
 def make_task(config: Config) -> tasks.Task:
     """What the pipeline needs to know."""
+    one_of("baseline", config.baseline, ["paper"])  # there is no other, nor another fidelity
+    one_of("fidelity", config.fidelity, ["released"])
     return tasks.Task(
         name="crossing",
         env=world,
@@ -46,4 +50,4 @@ def make_task(config: Config) -> tasks.Task:
 
 
 if __name__ == "__main__":
-    cli.main("examples.crossing.run", __doc__ or "", {"quick": quick}, make_task, run=ablation.run)
+    ablation.main("examples.crossing.run", __doc__ or "", {"quick": quick}, make_task)

@@ -16,6 +16,7 @@ from rp_jax.kinematics import (
     squared_distance,
     to_ego,
 )
+from rp_jax.validate import number
 
 # --- the agent ---
 
@@ -125,7 +126,13 @@ class Params(struct.PyTreeNode):
 
 
 def make_params(pedestrians: int = 6, time_limit: int = 100) -> Params:
-    """A road with so many pedestrians."""
+    """A road with so many pedestrians.
+
+    Raises:
+        ValueError: a value is out of range.
+    """
+    number("pedestrians", pedestrians, least=1, most=100, integer=True)
+    number("time_limit", time_limit, least=1, most=10**9, integer=True)
     agent, distance, pace, horizon = make_agent(), 0.15, 0.03, 8
     pedestrian = Pedestrian(
         distance=jnp.asarray(distance, float),

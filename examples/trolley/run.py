@@ -6,10 +6,11 @@ python -m examples.trolley.run --out results/trolley
 from dataclasses import dataclass, field
 
 from examples.trolley import world
-from experiments import ablation, cli, tasks
+from experiments import ablation, tasks
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.threat.build import ThreatConfig
 from rp_jax.threat.fit import FitConfig
+from rp_jax.validate import one_of
 
 CART = ThreatConfig(
     states=40_000,
@@ -33,11 +34,14 @@ class Config(tasks.Config):
 
 def quick(recipe: str) -> Config:
     """A few minutes on two cores."""
+    one_of("recipe", recipe, ["tuned"])
     return Config(episodes=4_000, planning=LoopConfig(steps=200_000, num_envs=128, batch=512))
 
 
 def make_task(config: Config) -> tasks.Task:
     """What the pipeline needs to know."""
+    one_of("baseline", config.baseline, ["paper"])  # there is no other, nor another fidelity
+    one_of("fidelity", config.fidelity, ["released"])
     return tasks.Task(
         name="trolley",
         env=world,
@@ -49,4 +53,4 @@ def make_task(config: Config) -> tasks.Task:
 
 
 if __name__ == "__main__":
-    cli.main("examples.trolley.run", __doc__ or "", {"quick": quick}, make_task, run=ablation.run)
+    ablation.main("examples.trolley.run", __doc__ or "", {"quick": quick}, make_task)

@@ -102,7 +102,8 @@ SECONDS: dict[str, dict[str, float]] = {
 THREAT_MINUTES = 40.0  # 10 to sample, less than 30 to fit
 TRAINING_HOURS = 24.0  # 3M steps of one seed of one task, on a GPU
 
-# The released agents, played again: return with its 95 % interval, crashes.
+# The released agents, played again in their own code (not part of this repository): return with its
+# 95 % interval, crashes.
 RELEASED: dict[str, dict[str, dict[str, str]]] = {
     "circuit": {
         "default": {

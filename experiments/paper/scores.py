@@ -134,7 +134,10 @@ def released(env: str) -> Table:
         for variant, of in published.RELEASED[env].items()
         for method, found in of.items()
     ]
-    return Table("The paper's released agents, played again", lines)
+    title = (
+        "The paper's released agents, played again in their own code, which is not part of this one"
+    )
+    return Table(title, lines)
 
 
 def _plain(method: str) -> str:

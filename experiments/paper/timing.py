@@ -150,7 +150,9 @@ def tell(results: dict[str, Any]) -> Section:
         claims += more if row["env"] in published.SECONDS else []
     return Section(
         f"Wall time of 100 decisions one after another, observation and threat included; median of "
-        f"{ROUNDS} rounds. The paper's machine is not known.",
+        f"{ROUNDS} rounds. On Circuit, {RP} is the run {TIMED['circuit'][RP]} (times do not depend "
+        "on what was learned). The paper's machine is not known. The released code, which is not "
+        "part of this repository, was timed once.",
         tables=[
             Table("Seconds per 100 actions", lines),
             Table("Learning, wall time", learned),

@@ -15,7 +15,7 @@ import numpy as np
 from rp_jax import shield
 from rp_jax.adapters import registry
 from rp_jax.envs import base
-from rp_jax.validate import positive
+from rp_jax.validate import number, positive
 
 try:
     import gymnasium
@@ -222,8 +222,19 @@ class Shielded(gymnasium.Wrapper):
             x: largest admissible threat; infinity lets everything pass.
             table: (A, D) the actions that threats are given for, where they are continuous.
             state: finds the state in the unwrapped environment; else it is the last observation.
+
+        Raises:
+            ValueError: the actions are not discrete and there is no table.
         """
         super().__init__(env)
+        if table is not None:
+            self._count = len(table)
+        elif isinstance(env.action_space, gymnasium.spaces.Discrete):
+            self._count = int(env.action_space.n)
+        else:
+            raise ValueError(
+                f"env: its actions are {env.action_space}; they must be Discrete, or have a table"
+            )
         self._threat, self._find, self._seen = threat, state, None
         self._table = table
         rows = None if table is None else jnp.asarray(table)
@@ -246,9 +257,14 @@ class Shielded(gymnasium.Wrapper):
 
         Raises:
             FloatingPointError: all threats are nan, or a number of the action is.
+            ValueError: there is no threat for each action, or the action is none.
         """
         state = self._seen if self._find is None else self._find(self.env.unwrapped)
         threat, wish = np.asarray(self._threat(state)), np.asarray(action)
+        if threat.shape != (self._count,):
+            raise ValueError(f"threat has shape {threat.shape}; it must be ({self._count},)")
+        if wish.dtype.kind in "iu" and wish.ndim == 0:
+            number("action", wish.item(), least=0, most=self._count - 1, integer=True)
         if np.isnan(threat).all():
             raise FloatingPointError(f"threat: all {threat.size} numbers are nan")
         if wish.dtype.kind == "f" and np.isnan(wish).any():

@@ -1,5 +1,6 @@
 """What every environment is: pure functions on frozen states, and one automatic reset."""
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
@@ -27,8 +28,17 @@ class Outcome(struct.PyTreeNode):
 
 
 BASELINES = ("paper", "plans")  # policies that threats are measured under
-SMALLEST = 0.02  # radius of a vehicle, at least: two cells of the table of distances to walls
+FIDELITIES = ("released", "paper")  # as the published numbers were made, or as the text says
 FARTHEST = 30  # steps within which wall points are hit, at most: the look-up tables grow with it
+
+
+def least_radius(gap: float, fastest: float) -> float:
+    """What a vehicle's radius must exceed for walls, points at most `gap` apart, to hold it.
+
+    Hits are looked for where steps end. A step of length `fastest` through the middle of a gap
+    begins and ends half of it from the wall; the vehicle has to touch the wall from there.
+    """
+    return math.hypot(gap, fastest) / 2
 
 
 class Hazards(NamedTuple):
@@ -41,12 +51,13 @@ class Hazards(NamedTuple):
 class Env(Protocol):
     """An environment is a module (or any object) with these functions; all are unbatched.
 
-    A `State` has the fields `agent` and `time`. `Params` are pytrees: sweep them by `vmap`.
+    A `State` has the fields `agent` and `time` (steps since the start), `Params` have `agent` (of
+    rp_jax.hazards.Agent) and `time_limit`. `Params` are pytrees: sweep them by `vmap`.
     """
 
     @property
     def LIDAR_BINS(self) -> int:  # noqa: N802
-        """How many of an observation's first values are a LIDAR's distances."""
+        """How many of an observation's first values are a LIDAR's distances: a multiple of 8."""
 
     @property
     def SCALE(self) -> tuple[float, ...]:  # noqa: N802

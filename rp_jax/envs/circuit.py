@@ -28,7 +28,6 @@ TURNS = (-0.15, -0.05, 0.0, 0.05, 0.15)  # radians / step
 SPEEDS = tuple(round(0.02 * k, 2) for k in range(-2, 6))  # -.04 .. .1 room units / step
 LIDAR_BINS = 360
 SCALE: tuple[float, ...] = (1.0, 1.0, 1.0, 10.0)  # of x, y, bend, speed, for learners
-FIDELITIES = ("released", "paper")
 
 
 class State(struct.PyTreeNode):
@@ -41,7 +40,8 @@ class State(struct.PyTreeNode):
 
 
 class Params(struct.PyTreeNode):
-    """Build by `make_params`; every field that is an array can be swept by `vmap`."""
+    """Build by `make_params`, anew for another track, radius, speed or horizon: tables follow
+    from them. `time_limit`, `stop_speed`, `beta` and `lost` can be replaced, or swept by `vmap`."""
 
     agent: AgentModel
     wall: WallPoint
@@ -82,11 +82,11 @@ def make_params(
     Raises:
         ValueError: a value is out of range, or the track cannot be driven.
     """
-    one_of("fidelity", fidelity, FIDELITIES)
+    one_of("fidelity", fidelity, base.FIDELITIES)
     one_of("baseline", baseline, base.BASELINES)
     positive("time_limit", time_limit, most=10**9, integer=True)
     positive("horizon", horizon, most=base.FARTHEST, integer=True)
-    number("radius", radius, least=base.SMALLEST, most=tracks.LARGEST)
+    number("radius", radius, above=base.least_radius(0.0, SPEEDS[-1]), most=tracks.LARGEST)
     positive("beta", beta, most=1.0)
     number("lost", lost, least=0, most=1)
     if not isinstance(track, tracks.TrackPlan):
@@ -102,8 +102,7 @@ def make_params(
         speeds=jnp.asarray(SPEEDS, float),
     )
     wall = WallPoint.create(agent, radius, horizon)
-    corner = np.maximum(np.abs(np.asarray(wall.window.lower)), np.asarray(wall.window.upper))
-    made = tracks.make_track(track, radius, float(np.hypot(*corner)))
+    made = tracks.make_track(track, radius, SPEEDS[-1], wall.window.farthest)
     return Params(
         agent=agent,
         wall=wall,

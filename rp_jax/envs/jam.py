@@ -26,6 +26,7 @@ from rp_jax.validate import number, one_of, positive
 
 ROOM = 3.0  # side of the square room
 EXIT = (2.2, 3.0)  # gap in the top wall
+SPACING = 0.02  # of the walls' points
 ACCELERATIONS = (-0.02, 0.0, 0.02)  # room units / step^2
 TURNS = (-0.3, -0.1, 0.0, 0.1, 0.3)  # radians / step
 SPEEDS = tuple(round(0.02 * k, 2) for k in range(-5, 6))  # -.1 .. .1 room units / step
@@ -39,7 +40,6 @@ SCALE: tuple[float, ...] = (1.0, 1.0, 1.0, 10.0) * (
     SEEN_OBSTACLES + 1
 )  # of x, y, heading, speed, for learners
 UNSEEN = (-1.5, -1.51)  # where the observation puts obstacles that do not exist
-FIDELITIES = ("released", "paper")
 COUNT = 0xC0DE  # folded into the key of a start for the number of obstacles
 EVADING = 3  # steps for which plans drive on or back off before they brake
 
@@ -62,7 +62,8 @@ class Draws(struct.PyTreeNode):
 
 
 class Params(struct.PyTreeNode):
-    """Build by `make_params`; every field that is an array can be swept by `vmap`."""
+    """Build by `make_params`, anew for another radius, speed or horizon: tables follow from them.
+    `start`, `time_limit`, `stop_speed`, `beta` and `fewest` can be replaced, or swept by `vmap`."""
 
     agent: AgentModel
     wall: WallPoint
@@ -83,8 +84,8 @@ class Params(struct.PyTreeNode):
 
 
 def wall_points() -> np.ndarray:
-    """(559, 2) the room's walls, a point every .02, without the exit."""
-    way = np.arange(150) * 0.02
+    """(559, 2) the room's walls, a point every SPACING, without the exit."""
+    way = np.arange(150) * SPACING
     bottom, left = np.stack([way, 0 * way], 1), np.stack([0 * way, way], 1)
     top = np.stack([way, 0 * way + ROOM], 1)
     right = np.stack([0 * way + ROOM, way], 1)
@@ -125,10 +126,10 @@ def make_params(
     Raises:
         ValueError: a value is out of range.
     """
-    one_of("fidelity", fidelity, FIDELITIES)
+    one_of("fidelity", fidelity, base.FIDELITIES)
     one_of("baseline", baseline, base.BASELINES)
     positive("time_limit", time_limit, most=10**9, integer=True)
-    number("radius", radius, least=base.SMALLEST, most=0.2)
+    number("radius", radius, above=base.least_radius(SPACING, SPEEDS[-1]), most=0.2)
     room = int((ROOM / (2 * radius)) ** 2)  # how many fit, side by side
     number("num_obstacles", num_obstacles, least=1, most=room, integer=True)
     positive("beta", beta, most=1.0)
@@ -159,7 +160,6 @@ def make_params(
     obstacle = MovingObstacle.create(
         agent, jnp.asarray(OBSTACLE_SPEEDS, float), behaviour, 2 * radius, obstacle_horizon
     )
-    corner = np.maximum(np.abs(np.asarray(wall.window.lower)), np.asarray(wall.window.upper))
     walls = wall_points()
     return Params(
         agent=agent,
@@ -170,7 +170,7 @@ def make_params(
         walls=sensing.distance_field(walls, radius) if plans else None,
         walls_in_view=sensing.points_within(walls, 1.0, 0.2),
         walls_in_contact=sensing.points_within(walls, radius, 0.1),
-        walls_in_reach=sensing.points_within(walls, float(np.hypot(*corner)), 0.2),
+        walls_in_reach=sensing.points_within(walls, wall.window.farthest, 0.2),
         time_limit=jnp.asarray(time_limit, jnp.int32),
         stop_speed=jnp.asarray(0.005, float),
         radius=jnp.asarray(radius, float),

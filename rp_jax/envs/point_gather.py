@@ -43,7 +43,6 @@ SCALE: tuple[float, ...] = (
     *(1.0,) * (2 * BINS),  # apples, bombs
 )  # of an observation, for learners
 USUAL_BOMBS = 8  # in the paper
-FIDELITIES = ("released", "paper")
 
 
 class Objects(struct.PyTreeNode):
@@ -66,7 +65,7 @@ class State(struct.PyTreeNode):
 
 
 class Params(struct.PyTreeNode):
-    """Build by `make_params`; every field that is an array can be swept by `vmap`."""
+    """Build by `make_params`; `time_limit` and `beta` can be replaced, or swept by `vmap`."""
 
     agent: AgentModel
     bomb: Bomb
@@ -106,7 +105,7 @@ def make_params(
     Raises:
         ValueError: a value is out of range.
     """
-    one_of("fidelity", fidelity, FIDELITIES)
+    one_of("fidelity", fidelity, base.FIDELITIES)
     room = len(cells())
     number("n_bombs", n_bombs, least=1, most=room, integer=True)
     # Of two numbers that do not fit together, that one is named which leaves its usual.

@@ -9,9 +9,11 @@ from jax import Array
 from scipy.spatial import cKDTree
 
 from rp_jax import sensing
+from rp_jax.envs.base import least_radius
 from rp_jax.validate import number, positive, shown
 
 SPACING = 0.02  # of points along straights, room units
+ALONG = 0.055  # of points along curves, at most, room units
 CELL = 0.2  # width of the look-up cells, room units
 VIEW = 1.0  # range of the LIDAR, room units
 LONGEST = 10_000  # points of a centre line, at most
@@ -22,7 +24,7 @@ LARGEST = 50.0  # side of the square that a track has to fit into, room units
 @dataclass(frozen=True)
 class TrackPlan:
     """A centre line drawn from (0, 0) along +x, one piece after another; each call returns a new
-    plan, the old one is left as it was.
+    plan, the old one is left as it was, and raises ValueError if the piece cannot be drawn.
 
     >>> TrackPlan().straight(2.0).curve(1.0, 180).straight(2.0).curve(1.0, 180)
     """
@@ -51,13 +53,17 @@ class TrackPlan:
         return self._extend(points[:-1], np.full(count, self.angle), points[-1], self.angle)
 
     def curve(self, radius: float, degrees: float) -> "TrackPlan":
-        """Turns by whole `degrees` (left is positive) on a circle of `radius` > 0."""
+        """Turns by whole `degrees` (left is positive) on a circle of `radius` > 0.
+
+        With a point for each degree, or several where they would be farther apart than ALONG.
+        """
         positive("curve: radius", radius, most=LARGEST)
         number("curve: degrees", degrees, least=-LONGEST, most=LONGEST)
         if degrees == 0 or degrees != round(degrees):
             raise ValueError(f"curve: degrees is {degrees}; it must be a whole number, not 0")
         side = np.sign(degrees)
-        turn = np.radians(np.arange(abs(int(degrees)) + 1)) * side
+        each = int(np.ceil(np.radians(1) * radius / ALONG))
+        turn = np.radians(np.arange(abs(int(degrees)) * each + 1) / each) * side
         angles = self.angle + turn
         outward = np.stack([np.sin(angles), -np.cos(angles)], axis=-1) * side
         centre = np.asarray(self.position) - radius * outward[0]
@@ -126,29 +132,32 @@ class Track(struct.PyTreeNode):
     direction: Array  # (n, 2) unit tangents
     onward: Array  # (n, 2) unit vectors from each centre point to the next
     walls: Array  # (w, 2) distinct wall points
-    half_width: Array  # ()
     nearest_centre: sensing.PointGrid
     walls_in_view: sensing.PointGrid  # within VIEW
     walls_in_contact: sensing.PointGrid  # within the vehicle's radius
     walls_in_reach: sensing.PointGrid  # within the threat's window
 
 
-def make_track(plan: TrackPlan, radius: float, reach: float) -> Track:
+def make_track(plan: TrackPlan, radius: float, fastest: float, reach: float) -> Track:
     """Checks a plan and prepares its look-up tables.
 
     Args:
         plan: a closed centre line.
         radius: of the vehicle; walls nearer than this are a crash.
+        fastest: length of its longest step.
         reach: largest distance at which a wall point can have a threat.
 
     Raises:
-        ValueError: the track is too narrow, not closed, or crosses itself.
+        ValueError: the track is too narrow, not closed, or crosses itself, or a step could lead
+            between two points of a wall.
     """
     _check_plan(plan, radius)
     centre, angles = plan.points, plan.angles
     direction = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     left = np.stack([-direction[:, 1], direction[:, 0]], axis=-1) * plan.half_width
-    walls = np.stack([centre + left, centre - left], axis=1).reshape(-1, 2)
+    sides = np.stack([centre + left, centre - left], axis=1)  # (n, 2, 2)
+    _check_walls(sides, radius, fastest)
+    walls = sides.reshape(-1, 2)
     # Coinciding points (the hub of a tight turn) are one event: counting it once keeps
     # Theorem 3's bound, and makes it tighter.
     _, first = np.unique(walls.round(9), axis=0, return_index=True)
@@ -160,18 +169,33 @@ def make_track(plan: TrackPlan, radius: float, reach: float) -> Track:
             f"track: at centre point {i} {centre[i].round(2)} a wall is {room[i]:.3f} away; it "
             f"must be farther than the vehicle's radius, {radius} (is a curve too tight?)"
         )
-    onward = np.roll(centre, -1, axis=0) - centre
+    onward = _steps(centre)
     return Track(
         centre=jnp.asarray(centre, float),
         onward=jnp.asarray(onward / np.linalg.norm(onward, axis=-1, keepdims=True), float),
         direction=jnp.asarray(direction, float),
         walls=jnp.asarray(walls, float),
-        half_width=jnp.asarray(plan.half_width, float),
         nearest_centre=sensing.nearest_of(centre, plan.half_width + CELL, CELL / 2),
         walls_in_view=sensing.points_within(walls, VIEW, CELL),
         walls_in_contact=sensing.points_within(walls, radius, CELL / 2),
         walls_in_reach=sensing.points_within(walls, reach, CELL),
     )
+
+
+def _steps(points: np.ndarray) -> np.ndarray:
+    """From each point (n, ...) of a closed line to the next."""
+    return np.roll(points, -1, axis=0) - points
+
+
+def _check_walls(sides: np.ndarray, radius: float, fastest: float) -> None:
+    """That a vehicle cannot slip through: sides (n, 2, 2) are the walls' points, in order."""
+    gaps = np.linalg.norm(_steps(sides), axis=-1).max(axis=1)
+    i, least = int(gaps.argmax()), least_radius(float(gaps.max()), fastest)
+    if radius <= least:
+        raise ValueError(
+            f"track: at centre point {i} points of a wall are {gaps[i]:.3f} apart; for steps of "
+            f"{fastest:g} the vehicle's radius, {radius:g}, must exceed {least:.4f}"
+        )
 
 
 def _check_shape(plan: TrackPlan) -> None:
@@ -195,6 +219,13 @@ def _check_shape(plan: TrackPlan) -> None:
     width, height = np.ptp(plan.points, axis=0)
     number("track: width", float(width), most=LARGEST)
     number("track: height", float(height), most=LARGEST)
+    step = np.linalg.norm(_steps(plan.points), axis=-1)
+    if step.min() < 1e-9:
+        i = int(step.argmin())
+        raise ValueError(
+            f"track: centre points {i} and {(i + 1) % len(step)} are one; neighbours must differ "
+            "(the last is the first one's neighbour)"
+        )
     if not isinstance(plan.position, tuple) or len(plan.position) != 2:
         raise ValueError(f"track: position is {plan.position!r}; it must be two numbers")
     for place in plan.position:
@@ -219,7 +250,7 @@ def _check_plan(plan: TrackPlan, radius: float) -> None:
         )
     # Wherever the track is far along but near in space, its two parts would overlap. On a
     # curve of radius >= half_width that is no nearer than half a turn of that radius.
-    step = np.linalg.norm(np.diff(centre, axis=0, append=centre[:1]), axis=-1)
+    step = np.linalg.norm(_steps(centre), axis=-1)
     along = np.concatenate([[0.0], np.cumsum(step)[:-1]])
     total = step.sum()
     for i in range(0, len(centre), 4):

@@ -9,6 +9,7 @@ import numpy as np
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 BLUE, RED = "#2b6cb0", "#c53030"
 
@@ -47,6 +48,10 @@ def _panel(axis: plt.Axes, one: Mapping[str, Any]) -> None:
     axis.set_yscale("log")
     axis.set_xticks(sizes, [f"{size:,.0f}" for size in sizes], rotation=40, fontsize=8)
     axis.minorticks_off()
+    low, high = axis.get_ylim()
+    if high < 20 * low:  # too few powers of ten to read
+        axis.yaxis.set_major_locator(MaxNLocator(5))
+        axis.yaxis.set_major_formatter(ScalarFormatter())
     axis.set_title(one["title"], fontsize=10)
     axis.set_xlabel(one["size"])
     axis.set_ylabel(f"seconds per {one['vertical']}")

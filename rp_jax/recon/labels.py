@@ -27,7 +27,7 @@ class Labels(struct.PyTreeNode):
     """Threats and their standard errors."""
 
     threat: Array  # (A,); (K * A,) where the baseline is K plans, plans counting slower
-    stderr: Array  # alike, 0 where exact, and where all sampled paths agree
+    stderr: Array  # alike, 0 where exact, and where all of several sampled paths agree
 
 
 MOST_LEAVES = 200_000  # of a tree that is enumerated
@@ -189,6 +189,9 @@ def best_estimator(sub: SubRMDP, paths: int, exact: bool = True) -> Estimator:
     """Exact enumeration where the hazard stays put and the tree is small enough.
 
     Elsewhere, or if not `exact`, Monte Carlo with `paths` rollouts, at least 1.
+
+    Raises:
+        ValueError: paths is not a number of paths.
     """
     number("paths", paths, least=1, integer=True)
     if isinstance(sub.agent.baseline, Plans):

@@ -13,6 +13,9 @@ from jax import Array
 
 from rp_jax.hazards import SubRMDP
 
+POOL = 4  # candidates per state that is drawn preferentially
+FLOOR = 0.05  # interest that every candidate has at least, so that none is out of the question
+
 
 @functools.partial(jax.jit, static_argnames="count")
 def uniform(key: Array, sub: SubRMDP, count: int) -> Array:
@@ -22,6 +25,12 @@ def uniform(key: Array, sub: SubRMDP, count: int) -> Array:
         return sub.source.features(*sub.source.sample(key, sub.agent))
 
     return jax.vmap(one)(jax.random.split(key, count))
+
+
+@jax.jit
+def states(sub: SubRMDP, features: Array) -> tuple[Any, Any]:
+    """The agents and hazards (n, ...) that features (n, F) were drawn from."""
+    return jax.vmap(sub.source.state_of)(features)
 
 
 def interest(threat: Array, x: Any) -> Array:
@@ -42,9 +51,6 @@ def preferential(
     threat: Array,
     x: Any,
     count: int,
-    *,
-    pool: int = 4,
-    floor: float = 0.05,
 ) -> Array:
     """(count, F) features of states that matter: threat near x, or the model in error.
 
@@ -59,21 +65,19 @@ def preferential(
         threat: (n, A) their labels.
         x: the threshold that matters.
         count: how many to draw.
-        pool: candidates per state drawn.
-        floor: interest that every candidate has at least, so that none is out of the question.
     """
     spread_key, pick_key, shift_key, thin_key = jax.random.split(key, 4)
-    half = count * pool // 2
-    spread = uniform(spread_key, sub, count * pool - half)
+    half = count * POOL // 2
+    spread = uniform(spread_key, sub, count * POOL - half)
     error = jnp.mean(jnp.abs(model(features) - threat), axis=-1)
     rows = jax.random.choice(pick_key, len(features), (half,), p=error / jnp.sum(error))
     fresh = uniform(shift_key, sub, half)
     # A step of a twentieth towards a uniform draw stays in reach, or nearly so.
     near = features[rows] + 0.05 * (fresh - features[rows])
     # Features that no state has (a heading that is not of unit length) are brought back.
-    near = jax.vmap(lambda f: sub.source.features(*sub.source.state_of(f)))(near)
+    near = jax.vmap(sub.source.features)(*states(sub, near))
     candidates = jnp.concatenate([spread, near])
-    weight = floor + interest(model(candidates), x)
+    weight = FLOOR + interest(model(candidates), x)
     # Gumbel noise draws without replacement, in proportion to the weights.
     noise = jax.random.gumbel(thin_key, (len(candidates),))
     return candidates[jnp.argsort(-(jnp.log(weight) + noise))[:count]]

@@ -18,6 +18,8 @@ from rp_jax.tabular.threat import Values, expected, returns, solve, threat
 from rp_jax.validate import number
 
 TOLERANCE = 1e-9  # of HiGHS, primal and dual
+ROUNDING = 1e-9  # what a vertex must lie above a chord, relative to the values' scale
+MOST = 10_000  # vertices
 
 
 class Optimum(NamedTuple):
@@ -35,6 +37,7 @@ def optimum(cmdp: FiniteCMDP, c: float) -> Optimum:
     Raises:
         ValueError: no policy keeps the danger at most c; or the horizon is infinite and the
             discounts differ, where stationary policies are not enough.
+        RuntimeError: the linear program could not be solved.
     """
     c = float(c) if np.ndim(c) == 0 and np.isrealobj(c) else c
     number("c", c, least=0, infinite=True)
@@ -133,13 +136,7 @@ def _point(cmdp: FiniteCMDP, policy: Array) -> tuple[Array, Array]:
     return expected(cmdp, threat(cmdp, policy)), expected(cmdp, returns(cmdp, policy))
 
 
-def frontier(
-    cmdp: FiniteCMDP,
-    above: float = 0.0,
-    upto: float = np.inf,
-    rounding: float = 1e-9,
-    limit: int = 10_000,
-) -> list[Vertex]:
+def frontier(cmdp: FiniteCMDP, upto: float = np.inf) -> list[Vertex]:
     """The whole Lagrangian curve: the vertices of the concave hull, by rising danger.
 
     Between neighbours, a coin tossed before the episode reaches every point of the line, and no
@@ -148,13 +145,11 @@ def frontier(
 
     Args:
         cmdp: the CMDP.
-        above: only chords that reach beyond this danger are divided,
-        upto: and only those that begin before this one.
-        rounding: a vertex must lie this much above the chord, relative to the values' scale.
-        limit: of vertices.
+        upto: only chords that begin before this danger are divided.
 
     Raises:
         ValueError: the horizon is infinite and the discounts differ.
+        RuntimeError: there are more than `MOST` vertices.
     """
     _same_discounts(cmdp)
 
@@ -169,19 +164,19 @@ def frontier(
     scale = max(1e-300, abs(low.value), abs(high.value), high.danger)
     found, open_chords = [low, high], [(low, high)]
     while open_chords:
-        if len(found) > limit:
-            raise RuntimeError(f"the Lagrangian curve has more than {limit} vertices")
+        if len(found) > MOST:
+            raise RuntimeError(f"the Lagrangian curve has more than {MOST} vertices")
         left, right = open_chords.pop()
         toll, prize = right.value - left.value, right.danger - left.danger
-        if prize <= rounding * scale or toll <= 0 or right.danger < above or left.danger > upto:
+        if prize <= ROUNDING * scale or toll <= 0 or left.danger > upto:
             continue
         size = np.hypot(toll, prize)
         between = vertex(toll / size, prize / size)
         gain = prize * (between.value - left.value) - toll * (between.danger - left.danger)
-        if gain / size > rounding * scale:
+        if gain / size > ROUNDING * scale:
             found.append(between)
             open_chords += [(left, between), (between, right)]
-    return _hull(found, rounding * scale)
+    return _hull(found, ROUNDING * scale)
 
 
 def _hull(vertices: list[Vertex], rounding: float) -> list[Vertex]:

@@ -176,7 +176,7 @@ def by_advantage(cmdp: FiniteCMDP, policy: Array, c: Array | float) -> Rule:
     values = threat(cmdp, policy)
     advantage = values.action - values.state[..., None]
     y = evaluated(cmdp, advantage, c)
-    return Rule(y, sets.secure(advantage, y))
+    return Rule(y, sets.secure_by_advantage(values, y))
 
 
 RULES = {

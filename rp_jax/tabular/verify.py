@@ -323,7 +323,7 @@ def draw_factored(
     key: Array, states: int, actions: int, hazards: int, horizon: int | None
 ) -> tuple[factored.Factored, Array]:
     """A random factored model of `states` states of agent and of each hazard, and eta^(o)."""
-    keys = iter(jax.random.split(key, 4 + 3 * hazards))
+    keys = iter(jax.random.split(key, 5 + 3 * hazards))
 
     def simplex(*shape: int) -> Array:
         return jax.random.dirichlet(next(keys), jnp.full(shape[-1], 0.5), shape[:-1])
@@ -331,7 +331,7 @@ def draw_factored(
     beta = jax.random.choice(next(keys), jnp.asarray(BETAS))
     model = factored.Factored(
         agent=simplex(states, actions, states),
-        reward=jax.random.normal(jax.random.fold_in(key, 0), (states, actions)),
+        reward=jax.random.normal(next(keys), (states, actions)),
         start=simplex(states),
         hazards=[
             factored.Hazard(
@@ -389,7 +389,8 @@ def violations_of_theorem_3(
     key: Array, states: int, actions: int, hazards: int, horizon: int | None
 ) -> dict[str, Array]:
     """As `violations`, on one random factored model."""
-    model, eta = draw_factored(key, states, actions, hazards, horizon)
-    other = jax.random.dirichlet(jax.random.fold_in(key, 2), jnp.ones(actions), eta.shape[:-1])
-    x = jax.random.uniform(jax.random.fold_in(key, 1), maxval=1.0)
+    model_key, other_key, x_key = jax.random.split(key, 3)
+    model, eta = draw_factored(model_key, states, actions, hazards, horizon)
+    other = jax.random.dirichlet(other_key, jnp.ones(actions), eta.shape[:-1])
+    x = jax.random.uniform(x_key, maxval=1.0)
     return {"theorem 3": theorem_3(model, jnp.stack([eta, other]), x)}

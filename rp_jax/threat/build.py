@@ -24,6 +24,7 @@ from rp_jax.validate import finite, leading, number, one_of, random_key
 
 Progress = Callable[[str, int, int], None]  # (stage, done, total)
 SAMPLINGS = ("uniform", "preferential")
+CHUNKS = 20  # of a fit: points of its curve, and times for a checkpoint
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,6 @@ class Built(NamedTuple):
 
 
 # Compiled whole: one by one, their operations would take a minute to compile.
-_states = jax.jit(lambda sub, features: jax.vmap(sub.source.state_of)(features))
 _preferential = jax.jit(sampling.preferential, static_argnames="count")
 _split = jax.jit(fit.split, static_argnames="share")
 _init = jax.jit(fit.init, static_argnames="config")
@@ -73,7 +73,7 @@ _logits = jax.jit(ThreatModel.logits)
 
 
 def _labelled(key, features, sub, estimator, stage, on_progress, mesh, checkpoints) -> Dataset:
-    agent, hazard = _states(sub, features)
+    agent, hazard = sampling.states(sub, features)
     watch = (lambda done, total: on_progress(stage, done, total)) if on_progress else None
     at = checkpoints.at(stage)
     found = labels.label(
@@ -96,10 +96,11 @@ def fitted(
     data: Dataset,
     config: FitConfig,
     on_progress: Progress | None = None,
-    chunks: int = 20,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> tuple[ThreatModel, list[dict[str, float]]]:
     """Fits a model to labelled states and their mirror images; returns it and its curve.
+
+    The steps are those of the settings, or a few more, so that all CHUNKS chunks are alike.
 
     Raises:
         ValueError: a setting is out of range, or there are not as many labels as states.
@@ -112,7 +113,8 @@ def fitted(
     train, held = _split(split_key, data, share=config.validation)
     train = fit.mirror(train, sub)
     model, state = _init(init_key, sub, train, config=config)
-    length = max(1, config.steps // chunks)
+    length = -(-config.steps // CHUNKS)
+    chunks = -(-config.steps // length)
     config = dataclasses.replace(config, steps=length * chunks)
 
     def step(i: int, carried: tuple[fit.FitState, np.ndarray]) -> tuple[fit.FitState, np.ndarray]:

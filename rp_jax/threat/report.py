@@ -20,11 +20,11 @@ def compare(predicted: np.ndarray, true: np.ndarray, x: float) -> dict[str, floa
     """Errors of predicted against true threats (n, A) of n states, and decisions at x.
 
     Returns:
-        mae, rmse, spearman (nan if either is constant); unsafe_called_safe: of the pairs truly
-        above x, the share predicted at most x; safe_called_unsafe: of the pairs truly at most x,
-        the share predicted above; and the number of pairs of either kind. unsafe_states: those
-        with an unsafe action; states_missed: of these, those with one called safe, and the
-        one-sided exact 95 % bound of their share.
+        mae, rmse, bias (predicted less true), spearman (nan if either is constant);
+        unsafe_called_safe: of the pairs truly above x, the share predicted at most x;
+        safe_called_unsafe: of the pairs truly at most x, the share predicted above; and the number
+        of pairs of either kind. unsafe_states: those with an unsafe action; states_missed: of
+        these, those with one called safe, and the one-sided exact 95 % bound of their share.
     """
     missed = (true > x) & (np.asarray(predicted) <= x)
     states, of = int(missed.any(axis=-1).sum()), int((true > x).any(axis=-1).sum())

@@ -214,7 +214,7 @@ def test_a_plan_of_ones_own_is_driven_like_the_others():
         ({"time_limit": 0}, "^time_limit is 0; it must be an integer, above 0"),
         ({"time_limit": 1.5}, r"^time_limit is 1\.5; it must be an integer"),
         ({"horizon": 0}, "^horizon is 0; it must be an integer, above 0"),
-        ({"radius": -0.1}, r"^radius is -0\.1; it must be a finite number, at least 0\.02"),
+        ({"radius": -0.1}, r"^radius is -0\.1; it must be a finite number, above 0\.05"),
         ({"beta": 1.5}, r"^beta is 1\.5; it must be a finite number, above 0, at most 1"),
         ({"lost": 1.5}, r"^lost is 1\.5; it must be a finite number, at least 0, at most 1"),
         ({"radius": 0.3}, r"^track: half_width is 0\.3; it must exceed .* radius, 0\.3"),

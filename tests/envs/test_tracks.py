@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +19,7 @@ from rp_jax.envs.tracks import (
     narrowed_plan,
 )
 
-RADIUS, REACH = 0.1, 0.7
+RADIUS, FASTEST, REACH = 0.1, 0.1, 0.7
 
 
 def oval(straight=2.0, radius=1.0, half_width=0.3, side=1):
@@ -35,7 +37,7 @@ def rounded_square(radius):
 
 
 def made(plan):
-    return jax.device_get(make_track(plan, RADIUS, REACH))
+    return jax.device_get(make_track(plan, RADIUS, FASTEST, REACH))
 
 
 def nearest(points, others):
@@ -73,7 +75,6 @@ def test_every_track_is_closed_and_free_of_walls_along_its_centre(name):
     np.testing.assert_allclose(np.linalg.norm(track.onward, axis=-1), 1, atol=1e-6)
     assert nearest(track.walls, track.centre).min() > plan.half_width - SPACING / 2
     assert nearest(track.centre, track.walls).max() < plan.half_width + 1e-5
-    assert track.half_width == np.float32(plan.half_width)
 
 
 def test_the_narrowed_track_has_the_default_centre_line_and_nearer_walls():
@@ -123,7 +124,7 @@ def test_close_leads_home_in_the_direction_of_the_start():
 
 
 def test_the_tables_find_all_walls_in_view_in_contact_and_in_reach():
-    track = make_track(default_plan(), RADIUS, REACH)
+    track = make_track(default_plan(), RADIUS, FASTEST, REACH)
     walls = np.asarray(track.walls)
     rng = np.random.default_rng(0)
     where = np.asarray(track.centre)[rng.integers(1253, size=200)]
@@ -141,7 +142,7 @@ def test_the_tables_find_all_walls_in_view_in_contact_and_in_reach():
 
 
 def test_the_nearest_centre_point_is_found_all_over_the_track_and_beyond_its_walls():
-    track = make_track(default_plan(), RADIUS, REACH)
+    track = make_track(default_plan(), RADIUS, FASTEST, REACH)
     rng = np.random.default_rng(1)
     where = np.asarray(track.centre)[rng.integers(1253, size=500)]
     where = where + rng.uniform(-0.3, 0.3, where.shape)
@@ -243,15 +244,55 @@ def test_a_plan_that_is_no_track_says_where_and_why(plan, message):
         made(plan)
 
 
+@pytest.mark.parametrize(
+    "plan",
+    [*(PLANS[name]() for name in PLANS), oval(4.0, 3.2), oval(4.0, 15.0), oval(1.0, 20.0, 3.0)],
+)
+def test_no_step_leads_between_two_points_of_a_wall(plan):
+    track = made(plan)
+    left = np.stack([-np.sin(plan.angles), np.cos(plan.angles)], axis=-1)
+    for side in (plan.points + plan.half_width * left, plan.points - plan.half_width * left):
+        step = np.roll(side, -1, axis=0) - side
+        across = step[:, ::-1] * [1, -1] / np.maximum(np.linalg.norm(step, axis=-1), 1e-9)[:, None]
+        for end in (-FASTEST / 2, FASTEST / 2):
+            assert nearest(track.walls, side + step / 2 + end * across).max() < RADIUS
+
+
+def test_walls_with_holes_are_refused():
+    plan = circle_plan()
+    thin = replace(plan, points=plan.points[::4], angles=plan.angles[::4])
+    says = r"^track: at centre point \d+ points of a wall are 0\.23\d apart; .* must exceed 0\.12"
+    with pytest.raises(ValueError, match=says):
+        made(thin)
+    with pytest.raises(
+        ValueError, match=r"points of a wall are 0\.058 .* 0\.055, must exceed 0\.0577"
+    ):
+        make_track(plan, 0.055, FASTEST, REACH)
+    make_track(plan, 0.058, FASTEST, REACH)
+
+
+def test_a_point_that_is_its_own_neighbour_is_refused():
+    plan = circle_plan()
+    closed = replace(
+        plan,
+        points=np.concatenate([plan.points, plan.points[:1]]),
+        angles=np.concatenate([plan.angles, plan.angles[:1]]),
+    )
+    with pytest.raises(
+        ValueError, match=r"^track: centre points 360 and 0 are one; .* must differ"
+    ):
+        made(closed)
+
+
 def test_the_last_point_of_a_closed_plan_leads_onward():
     plan = TrackPlan().straight(2).curve(1, -180).straight(3).close(radius=1)
-    track = make_track(plan, 0.1, 0.7)
+    track = made(plan)
     np.testing.assert_allclose(track.onward[-1], [1, 0], atol=0.05)
 
 
 def test_close_turns_left_from_above():
     plan = TrackPlan().straight(2).curve(1, 180).straight(3).close(radius=1)
-    track = make_track(plan, 0.1, 0.7)
+    track = made(plan)
     assert track.centre[:, 1].min() >= -1e-6
 
 

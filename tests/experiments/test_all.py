@@ -43,7 +43,7 @@ class Runs:
         status = 130 if stops else self.exits.get(folder.name, 0)
         if status != 2:  # which is bad input, before anything is written
             storage.write_json(
-                folder / "config.json", {"experiment": command[2]} | settings.machine()
+                folder / "config.json", {"experiment": command[2]} | settings.machine(command[2])
             )
         checkpoints = folder / settings.CHECKPOINTS
         if stops:
@@ -86,7 +86,7 @@ def test_an_interrupted_run_of_other_code_begins_anew(runs, tmp_path, monkeypatc
     runs.stops.add("jam")
     with pytest.raises(KeyboardInterrupt):
         module.Sources(tmp_path, "quick")("jam")
-    monkeypatch.setattr(settings, "code", lambda: "other")
+    monkeypatch.setattr(settings, "code", lambda experiment: "other")
     module.Sources(tmp_path, "quick")("jam")
     assert "--resume" not in runs.commands[1]
 

@@ -107,7 +107,7 @@ def test_what_cannot_be_parsed_is_named(argv, says, refused):
 def test_unknown_tracks_are_named(refused):
     says = "track is 'oval'; it must be one of 'default', 'narrowed', 'circle'"
     refused("circuit", "--track", "oval", says=says)
-    refused("circuit", "--test-tracks", "circle", "oval", says=says)
+    refused("circuit", "--test-tracks", "circle", "oval", says=f"test_tracks: {says}")
     refused("circuit", "--test-tracks", says="test_tracks is (); it must name at least one")
 
 
@@ -115,7 +115,13 @@ def test_values_of_jam_out_of_range_are_named(refused):
     refused("jam", "--obstacles", "0", says="obstacles is 0; it must be an integer, at least 1")
     refused("jam", "--obstacles", "-8", says="obstacles is -8; it must be")
     refused("jam", "--obstacles", "100000", says=("obstacles is 100000; it must be", "at most 225"))
-    refused("jam", "--test-obstacles", "3", "226", says="obstacles is 226; it must be")
+    refused(
+        "jam",
+        "--test-obstacles",
+        "3",
+        "226",
+        says="test_obstacles: num_obstacles is 226; it must be",
+    )
     refused("jam", "--test-obstacles", says="test_obstacles is (); it must name at least one")
     refused("jam", "--x", "nan", says="x is nan; it must be a number, at least 0")
     refused("jam", "--preset", "huge", says="preset is 'huge'; it must be one of 'quick', 'full'")

@@ -8,6 +8,7 @@ import pytest
 from tiny import programs_of_a_moment  # noqa: F401
 
 from experiments import compare, settings
+from rp_jax import storage
 from rp_jax.baselines.actor_critic import ActorCriticConfig
 from rp_jax.baselines.cpo import CPOConfig
 from rp_jax.baselines.pid_lagrangian import PIDConfig
@@ -46,6 +47,8 @@ def test_every_method_has_its_rows(finished, tmp_path, monkeypatch, capsys):
         text = (out / name / "metrics.jsonl").read_text()
         history = [json.loads(line) for line in text.splitlines()]
         dqn = json.loads((out / "dqn" / "metrics.jsonl").read_text().splitlines()[0])
+        kept = storage.read_manifest(out / name / "agent", "actor")["about"]
+        assert (kept["method"], len(kept["members"])) == (method, 1)
         own = {"cpo": {"kl", "recoveries", "accepted"}, "pid": {"multiplier"}}[name]
         assert set(history[0]) == set(dqn) - {"insecure", "inadmissible", "loss"} | own
         if name == "cpo":

@@ -13,7 +13,7 @@ from tiny import TINY, TINY_THREAT, moment
 from examples.crossing import run as crossing
 from examples.trolley import run as trolley
 from examples.trolley import world
-from experiments import ablation, cli
+from experiments import ablation
 from rp_jax.adapters import physics
 from rp_jax.recon import labels, sampling
 
@@ -48,7 +48,7 @@ def test_a_world_of_ones_own_goes_all_the_way(module, kinds, options, variants, 
     name, about = module.__name__, module.__doc__
     presets, make = {"quick": module.quick}, module.make_task
     with moment():
-        cli.main(name, about, presets, make, [*argv, "--out", str(out)], ablation.run)
+        ablation.main(name, about, presets, make, [*argv, "--out", str(out)])
     rows = json.loads((out / "table.json").read_text())
     assert len({row["variant"] for row in rows}) == variants
     assert len(rows) == variants * 5  # at random twice, two DQNs, RP

@@ -13,7 +13,7 @@ import pytest
 from scipy import stats
 from tiny import programs_of_a_moment  # noqa: F401
 
-from experiments import certify, circuit, jam, rare, runs, settings, tasks
+from experiments import certify, circuit, jam, mpc, rare, runs, settings, tasks
 from rp_jax import evaluate, statistics, storage
 from rp_jax.envs.tracks import circle_plan
 from rp_jax.planning import loop
@@ -45,6 +45,21 @@ def test_settings_of_the_wrong_type_are_named(field, value, kind):
         settings.restored(jam.Config, {field: value}, "file")
     with pytest.raises(storage.StorageError, match="must be a table"):
         settings.restored(jam.Config, {"planning": 3}, "file")
+
+
+def test_a_setting_that_has_no_default_is_missed():
+    with pytest.raises(storage.StorageError, match=r"^file: env is missing; it must be there"):
+        settings.restored(mpc.Config, {"horizon": 3}, "file")
+
+
+def test_only_runs_of_the_pipeline_have_agents_to_load(finished, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(finished, copy)
+    plain = json.loads((copy / "config.json").read_text())
+    storage.write_json(copy / "config.json", {**plain, "experiment": "experiments.patrol"})
+    says = r"experiment is 'experiments.patrol'; it must be one of 'experiments.circuit'"
+    with pytest.raises(ValueError, match=says):
+        runs.load(copy)
 
 
 def test_a_run_comes_back_with_the_agents_that_its_table_speaks_of(finished):
@@ -115,6 +130,7 @@ def test_a_rate_is_shown_or_not_shown_with_the_planned_episodes(finished, monkey
         (["--c", "0"], "c is 0.0"),
         (["--c", "0.1", "--confidence", "1"], "confidence is 1.0"),
         (["--c", "0.1", "--expected", "0.2"], "expected is 0.2"),
+        (["--c", "0.1", "--expected", "0.0999999"], "expected: episodes needed is"),
         (["--c", "0.1", "--agent", "2"], "agent is 2; it must be"),
         (["--c", "0.1", "--variant", "N=8"], "variant is 'N=8'"),
     ],

@@ -1,8 +1,14 @@
+import dataclasses
+import types
+
 import jax
 import numpy as np
 import pytest
 
-from experiments import circuit, tasks
+from examples.crossing import run as crossing
+from examples.trolley import run as trolley
+from experiments import ablation, circuit, jam, patrol, pipeline, settings, tasks
+from rp_jax.envs import circuit as world
 from rp_jax.planning import loop
 
 
@@ -60,3 +66,80 @@ def test_what_learned_to_do_without_x_and_y_is_told_them_only_on_its_own_track()
     assert lost(lost=0.25) == (0.25, {"default": 0.0, "narrowed": 0.0, "circle": 1.0})
     swapped = {"track": "circle", "test_tracks": ("circle", "narrowed")}
     assert lost(lost=0.25, **swapped) == (0.25, {"circle": 0.0, "narrowed": 1.0})
+
+
+def test_the_threshold_is_nowhere_above_what_was_asked_for():
+    task = circuit.make_task(circuit.Config())
+    for x in (0.1, 0.001, 0.9, 0.0, float("inf")):
+        config = dataclasses.replace(circuit.Config(), x=x)
+        members = tasks.members_of(config)
+        pmdp = tasks.make_pmdp(task, config, None, task.train)
+        for found in (pmdp.x, tasks.side_by_side(pmdp, members)[0].x[0]):
+            assert found.dtype == np.float32
+            assert float(found) <= x
+            assert float(np.nextafter(np.asarray(found), np.float32(np.inf))) > x or x == np.inf
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"tests": {}}, r"^tests is \{\}; the task must name at least one variant"),
+        ({"threats": {}}, "^kind of hazard of circuit is 'wall'; it must be one of"),
+        (
+            {"env": types.SimpleNamespace(**{**vars(world), "LIDAR_BINS": 100})},
+            "^LIDAR_BINS is 100; it must be a multiple of 8",
+        ),
+    ],
+)
+def test_a_task_that_is_not_whole_is_refused_before_any_work(changes, message):
+    make = lambda config: circuit.make_task(config)._replace(**changes)  # noqa: E731
+    with pytest.raises(ValueError, match=message):
+        pipeline.checked(make, circuit.Config())
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--x", "inf"], "x is inf; it must be a finite number"),
+        (["--learning-penalty", "5"], "learning_penalty is 5.0; it must be"),
+        (["--learning-penalty-from", "5"], "learning_penalty_from is 5.0; it must be one of None"),
+    ],
+)
+def test_comparisons_of_shields_set_the_penalty_themselves(words, message, tmp_path, capsys):
+    argv = [*words, "--out", str(tmp_path / "new")]
+    with pytest.raises(SystemExit, match="2"):
+        ablation.main("experiments.patrol", "", jam.PRESETS, patrol.make_task, argv)
+    assert message in " ".join(capsys.readouterr().out.split())
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("module", "changes"),
+    [
+        (crossing, {"baseline": "plans"}),
+        (crossing, {"fidelity": "paper"}),
+        (crossing, {"test_pedestrians": (0,)}),
+        (trolley, {"baseline": "plans"}),
+    ],
+)
+def test_worlds_of_ones_own_refuse_what_they_have_not(module, changes):
+    config = dataclasses.replace(module.quick("tuned"), **changes)
+    with pytest.raises(ValueError, match=r"^(baseline|fidelity|pedestrians) is .*; it must be"):
+        module.make_task(config)
+    with pytest.raises(ValueError, match=r"^recipe is 'paper'; it must be one of 'tuned'"):
+        module.quick("paper")
+
+
+def test_the_code_of_a_run_is_also_that_of_its_own_world(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    folder = tmp_path / "odd_world"
+    folder.mkdir()
+    for name in ("__init__.py", "world.py", "run.py"):
+        (folder / name).write_text("")
+    code = settings.code.__wrapped__
+    before = code("odd_world.run")
+    assert before == code("odd_world.run")
+    (folder / "world.py").write_text("GRAVITY = 2")
+    assert code("odd_world.run") != before
+    assert code("experiments.jam") == code("experiments.mpc") == code("no.such.module")
+    assert code("examples.crossing.run") not in (code("experiments.jam"), before)

@@ -85,7 +85,7 @@ def scouted(exact):
     features = uniform(jax.random.key(3), sub, 2000)
     data = Dataset(features, exact(features, sub).threat)
     config = FitConfig(hidden=(32,), steps=400, batch=256, learning_rate=1e-2)
-    model, _ = build.fitted(jax.random.key(4), sub, data, config, chunks=2)
+    model, _ = build.fitted(jax.random.key(4), sub, data, config)
     return sub, data, model
 
 

@@ -142,8 +142,15 @@ def test_a_fit_shorter_than_its_chunks_still_runs():
     sub, _, _ = built(circuit, "wall", "uniform")
     data = Dataset(draw(jax.random.key(3), sub, 150), jnp.full((150, 15), 0.1))
     config = dataclasses.replace(TINY.fit, steps=3)
-    _, curve = build.fitted(jax.random.key(4), sub, data, config, chunks=2)
-    assert [row["step"] for row in curve] == [1, 2]
+    _, curve = build.fitted(jax.random.key(4), sub, data, config)
+    assert [row["step"] for row in curve] == [1, 2, 3]
+
+
+def test_a_fit_takes_no_fewer_steps_than_asked():
+    sub, _, _ = built(circuit, "wall", "uniform")
+    data = Dataset(draw(jax.random.key(3), sub, 150), jnp.full((150, 15), 0.1))
+    _, curve = build.fitted(jax.random.key(4), sub, data, dataclasses.replace(TINY.fit, steps=39))
+    assert [row["step"] for row in curve] == list(range(2, 42, 2))
 
 
 @pytest.mark.parametrize(
