@@ -12,7 +12,7 @@ def once(tmp_path_factory, name, *options):
     folder.parent.mkdir(exist_ok=True)
     with folder.with_suffix(".lock").open("a+") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if not lock.tell():
+        if not lock.seek(0, os.SEEK_END):  # as it is now that the lock is held
             with moment():
                 go(name, folder, *options)
             lock.write("made")
