@@ -1,14 +1,14 @@
 """The same learner without a shield, without one but penalised, and with it, from one program."""
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from experiments import cli, console, pipeline, reconnaissance, tables, tasks, training
-from rp_jax import evaluate, shield, storage
+from rp_jax import evaluate, storage
 from rp_jax.checkpoints import Checkpoints
 from rp_jax.validate import number, one_of
 
@@ -40,8 +40,8 @@ def at_random(
     rows = []
     for variant, params in task.tests.items():
         for x in (float("inf"), config.x):
-            pmdp = tasks.make_pmdp(task, config, models, params)
-            episodes = play(pmdp.replace(x=jnp.asarray(shield.rounded_down(x))))
+            own = dataclasses.replace(config, x=x)
+            episodes = play(tasks.make_pmdp(task, own, models, params))
             method = "random" if x == float("inf") else f"random, shield (x={x:g})"
             evaluate.check(episodes, method)
             found = evaluate.summarise(episodes, config.penalty)

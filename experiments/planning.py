@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 from experiments import console, tasks, training
 from experiments.training import Member, Trained
 from rp_jax import devices, storage
-from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
+from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints, chunks_of
 from rp_jax.planning import loop
 from rp_jax.planning.loop import LoopConfig, LoopState
 from rp_jax.planning.pmdp import PMDP
@@ -81,7 +81,8 @@ def plan(
         FloatingPointError: something that was seen or learned is not a finite number.
     """
     planning, mesh = config.planning, devices.mesh_of(config.devices)
-    chunks, length = training.chunks_of(max(1, planning.iterations - planning.filling))
+    iterations = max(1, planning.iterations - planning.filling)
+    chunks, length = chunks_of(iterations, training.CHUNKS)
     names = [tasks.method_name(config, member) for member in members]
     announce(names, (planning.filling + chunks * length) * planning.num_envs, planning)
     pmdp, axes = tasks.side_by_side(pmdp, members)

@@ -14,7 +14,7 @@ import numpy as np
 from experiments import console, evaluation, tasks, training
 from rp_jax import evaluate, storage
 from rp_jax.baselines import actor_critic, cpo, pid_lagrangian
-from rp_jax.checkpoints import Checkpoints
+from rp_jax.checkpoints import Checkpoints, chunks_of
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import finite, none_bad
 
@@ -49,7 +49,8 @@ def learn(
     name, learning, limit = method
     learner, members = LEARNERS[name], tasks.members_of(config)
     names = [name] * len(members)
-    chunks, length = training.chunks_of(-(-config.planning.steps // learning.rollout.steps))
+    rounds = -(-config.planning.steps // learning.rollout.steps)
+    chunks, length = chunks_of(rounds, training.CHUNKS)
     folder.mkdir(exist_ok=True)
 
     def chunk(state: Any, pmdp: PMDP, c: jax.Array) -> tuple[Any, dict[str, jax.Array]]:

@@ -49,12 +49,6 @@ class Trained(NamedTuple):
     compile_seconds: float
 
 
-def chunks_of(units: int) -> tuple[int, int]:
-    """(chunks, units of each), for at least `units` updates or iterations."""
-    length = -(-units // CHUNKS)
-    return -(-units // length), length
-
-
 def learn(
     learners: Learners,
     state: Any,

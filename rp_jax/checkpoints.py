@@ -20,6 +20,12 @@ INTERVAL = 60.0  # seconds between two checkpoints of a loop, at least
 SHARE = 0.01  # of a loop's time that goes into checkpoints, at most
 
 
+def chunks_of(units: int, most: int) -> tuple[int, int]:
+    """(chunks, units of each): at most so many, all alike, of at least `units` together."""
+    length = -(-units // most)
+    return -(-units // length), length
+
+
 @dataclass(frozen=True)
 class Checkpoints:
     """A folder with the checkpoints of one loop, or with such folders; or none."""

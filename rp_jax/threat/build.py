@@ -14,7 +14,7 @@ from jax import Array
 from jax.sharding import Mesh
 
 from rp_jax import statistics
-from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
+from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints, chunks_of
 from rp_jax.hazards import SubRMDP
 from rp_jax.recon import labels, sampling
 from rp_jax.threat import fit, report
@@ -113,8 +113,7 @@ def fitted(
     train, held = _split(split_key, data, share=config.validation)
     train = fit.mirror(train, sub)
     model, state = _init(init_key, sub, train, config=config)
-    length = -(-config.steps // CHUNKS)
-    chunks = -(-config.steps // length)
+    chunks, length = chunks_of(config.steps, CHUNKS)
     config = dataclasses.replace(config, steps=length * chunks)
 
     def step(i: int, carried: tuple[fit.FitState, np.ndarray]) -> tuple[fit.FitState, np.ndarray]:

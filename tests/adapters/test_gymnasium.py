@@ -305,33 +305,35 @@ def test_stable_baselines_learns_from_it():
     assert len(learner.ep_info_buffer) >= 400 // 12
 
 
+def guarded_lake(threats):
+    """A shielded lake in which threats do not depend on the state."""
+    env = adapter.Shielded(gymnasium.make("FrozenLake-v1"), lambda _: threats, 0.1)
+    env.reset(seed=0)
+    return env
+
+
 @pytest.mark.parametrize("wish", [0, np.zeros(4, np.float32)])
 def test_threats_that_are_all_nan_stop_a_shield(wish):
-    lake = gymnasium.make("FrozenLake-v1", is_slippery=False)
-    env = adapter.Shielded(lake, lambda _: np.full(4, np.nan), 0.1)
-    env.reset(seed=0)
+    env = guarded_lake(np.full(4, np.nan))
     with pytest.raises(FloatingPointError, match=r"^threat: all 4 numbers are nan"):
         env.step(wish)
 
 
 def test_scores_that_are_nan_stop_a_shield():
-    env = adapter.Shielded(gymnasium.make("FrozenLake-v1"), lambda _: np.zeros(4), 0.1)
-    env.reset(seed=0)
+    env = guarded_lake(np.zeros(4))
     with pytest.raises(FloatingPointError, match=r"^action: 1 of 4 numbers are nan"):
         env.step(np.asarray([0.0, np.nan, 1.0, 0.0], np.float32))
 
 
 @pytest.mark.parametrize("wish", [-1, 4, 99])
 def test_an_action_that_is_none_is_refused_by_a_shield(wish):
-    env = adapter.Shielded(gymnasium.make("FrozenLake-v1"), lambda _: np.zeros(4), 0.1)
-    env.reset(seed=0)
+    env = guarded_lake(np.zeros(4))
     with pytest.raises(ValueError, match=f"^action is {wish}; it must be an integer, at least 0"):
         env.step(wish)
 
 
 def test_threats_of_other_actions_than_there_are_are_refused():
-    env = adapter.Shielded(gymnasium.make("FrozenLake-v1"), lambda _: np.zeros(3), 0.1)
-    env.reset(seed=0)
+    env = guarded_lake(np.zeros(3))
     with pytest.raises(ValueError, match=r"^threat has shape \(3,\); it must be \(4,\)"):
         env.step(0)
     with pytest.raises(ValueError, match=r"^env: its actions are Box.*; they must be Discrete"):

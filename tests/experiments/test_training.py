@@ -12,7 +12,7 @@ from experiments import console, policy_gradient, tasks, training
 from rp_jax.baselines.actor_critic import ActorCriticConfig
 from rp_jax.baselines.cpo import CPOConfig
 from rp_jax.baselines.pid_lagrangian import PIDConfig
-from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
+from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints, chunks_of
 from rp_jax.planning.loop import LoopConfig
 
 COUNTED = ("steps", "episodes", "score", "danger", "crashes", "goals")
@@ -23,7 +23,7 @@ MEMBERS = [training.Member(3, 0.1, 0.0), training.Member(4, 0.1, 0.0)]
 
 @pytest.mark.parametrize("units", [1, 7, 30, 31, 1000])
 def test_chunks_hold_all_units_and_few_more(units):
-    chunks, length = training.chunks_of(units)
+    chunks, length = chunks_of(units, training.CHUNKS)
     assert chunks <= training.CHUNKS
     assert units <= chunks * length < units + length
 
