@@ -86,9 +86,8 @@ class State(NamedTuple):
     """Carried through learning."""
 
     states: Any  # (B,) environment states
-    score: Array  # (B,) reward of the running episodes
-    danger: Array  # (B,) likewise
-    earned: Array  # (B,) likewise reward, less the penalty, discounted as of now
+    running: base.Running  # (B,) episodes
+    earned: Array  # (B,) their reward, less the penalty, discounted as of now
     spread: Spread
     recent: Recent
     actor: Any
@@ -172,8 +171,7 @@ def init(key: Array, pmdp: PMDP, config: ActorCriticConfig) -> State:
     zero = jnp.zeros_like(pmdp.x)
     return State(
         states=states,
-        score=nothing,
-        danger=nothing,
+        running=base.Running(nothing, nothing),
         earned=nothing,
         spread=Spread(zero, zero),
         recent=Recent(zero, zero, zero),
@@ -240,7 +238,7 @@ def collect(
         return encoded, elapsed, jnp.asarray(critic.apply(state.critic, encoded, elapsed))
 
     def one(carry, key):
-        states, (encoded, elapsed, value), *sums = carry
+        states, (encoded, elapsed, value), running, earned = carry
         act_key, step_key = jax.random.split(key)
         policy: Any = actor.apply(state.actor, encoded)
         action = policy.sample(act_key)
@@ -251,25 +249,22 @@ def collect(
         reward = outcome.reward - pmdp.penalty * outcome.danger
         signal = jnp.stack([reward, outcome.danger], axis=-1)
         step = _Step(encoded, elapsed, action, signal, value, next_value, outcome.done)
-        score, danger = sums[0] + outcome.reward, sums[1] + outcome.danger
-        earned = config.gamma * sums[2] + reward
+        running, ended = base.tally(running, outcome)
+        earned = config.gamma * earned + reward
+        dtype = ended.score.dtype
         bad_observation, bad_signal = faults(encoded, signal)
         metrics = Metrics(
-            steps=jnp.asarray(config.num_envs, score.dtype),
-            episodes=jnp.sum(outcome.done, dtype=score.dtype),
-            score=jnp.sum(jnp.where(outcome.done, score, 0.0)),
-            danger=jnp.sum(jnp.where(outcome.done, danger, 0.0)),
-            crashes=jnp.sum(outcome.done & (danger > 0), dtype=score.dtype),
-            goals=jnp.sum(outcome.goal, dtype=score.dtype),
-            bad_observations=jnp.sum(bad_observation, dtype=score.dtype),
-            bad_rewards=jnp.sum(bad_signal, dtype=score.dtype),
+            steps=jnp.asarray(config.num_envs, dtype),
+            **ended._asdict(),
+            bad_observations=jnp.sum(bad_observation, dtype=dtype),
+            bad_rewards=jnp.sum(bad_signal, dtype=dtype),
         )
-        running = [jnp.where(outcome.done, 0.0, total) for total in (score, danger, earned)]
-        return (*carried, *running), (step, metrics, jnp.sum(jnp.square(earned)))
+        ahead = jnp.where(outcome.done, 0.0, earned)
+        return (*carried, running, ahead), (step, metrics, jnp.sum(jnp.square(earned)))
 
-    begin = (state.states, look(state.states), state.score, state.danger, state.earned)
+    begin = (state.states, look(state.states), state.running, state.earned)
     keys = jax.random.split(key, config.length)
-    (states, _, *sums), (steps, metrics, squares) = jax.lax.scan(one, begin, keys)
+    (states, _, running, earned), (steps, metrics, squares) = jax.lax.scan(one, begin, keys)
     metrics = jax.tree.map(lambda m: jnp.sum(m, axis=0), metrics)
     before = state.spread
     spread = Spread(before.squares + jnp.sum(squares), before.steps + config.steps)
@@ -280,7 +275,7 @@ def collect(
     batch = Batch(steps.encoded, steps.elapsed, steps.action, advantage, target)
     batch = jax.tree.map(lambda a: a.reshape(config.steps, *a.shape[2:]), batch)
     state = state._replace(states=states, spread=spread, recent=recent)
-    return state._replace(score=sums[0], danger=sums[1], earned=sums[2]), batch, metrics
+    return state._replace(running=running, earned=earned), batch, metrics
 
 
 def update_critic(state: State, batch: Batch, pmdp: PMDP, config: ActorCriticConfig) -> State:

@@ -27,6 +27,37 @@ class Outcome(struct.PyTreeNode):
         return self.terminated | self.truncated
 
 
+class Running(NamedTuple):
+    """What the episodes that are going on have come to, (B,) each."""
+
+    score: Array  # reward
+    danger: Array
+
+
+class Ended(NamedTuple):
+    """Sums over the episodes that ended in a step."""
+
+    episodes: Array
+    score: Array  # reward, without any penalty for danger
+    danger: Array
+    crashes: Array  # episodes with any danger
+    goals: Array
+
+
+def tally(running: Running, outcome: Outcome) -> tuple[Running, Ended]:
+    """Counts a step (B,); what ended begins at 0 again."""
+    total = Running(running.score + outcome.reward, running.danger + outcome.danger)
+    dtype = total.score.dtype
+    ended = Ended(
+        episodes=jnp.sum(outcome.done, dtype=dtype),
+        score=jnp.sum(jnp.where(outcome.done, total.score, 0.0)),
+        danger=jnp.sum(jnp.where(outcome.done, total.danger, 0.0)),
+        crashes=jnp.sum(outcome.done & (total.danger > 0), dtype=dtype),
+        goals=jnp.sum(outcome.goal, dtype=dtype),
+    )
+    return jax.tree.map(lambda a: jnp.where(outcome.done, 0.0, a), total), ended
+
+
 BASELINES = ("paper", "plans")  # policies that threats are measured under
 FIDELITIES = ("released", "paper")  # as the published numbers were made, or as the text says
 FARTHEST = 30  # steps within which wall points are hit, at most: the look-up tables grow with it

@@ -105,8 +105,7 @@ class LoopState(NamedTuple):
 
     states: Any  # (B,) environment states
     seen: Seen  # of those states
-    score: Array  # (B,) reward of the running episodes
-    danger: Array  # (B,) likewise
+    running: base.Running  # (B,) episodes
     window: Taken  # (n_step, B), oldest first
     learner: Learner
     replay: Any
@@ -190,32 +189,23 @@ def interact(
         next_encoded=seen.encoded,
         next_admissible=seen.bits,
     )
-    score, danger = state.score + outcome.reward, state.danger + outcome.danger
+    running, ended = base.tally(state.running, outcome)
+    dtype = ended.score.dtype
     bad_observation, bad_threat = faults(state.seen.encoded, state.seen.threat)
     metrics = Metrics(
-        steps=jnp.asarray(batch, score.dtype),
-        episodes=jnp.sum(outcome.done, dtype=score.dtype),
-        score=jnp.sum(jnp.where(outcome.done, score, 0.0)),
-        danger=jnp.sum(jnp.where(outcome.done, danger, 0.0)),
-        crashes=jnp.sum(outcome.done & (danger > 0), dtype=score.dtype),
-        goals=jnp.sum(outcome.goal, dtype=score.dtype),
-        insecure=jnp.sum(jnp.min(state.seen.threat, axis=-1) > pmdp.x, dtype=score.dtype),
-        inadmissible=jnp.sum(_inadmissible(state.seen.threat, action, pmdp.x), dtype=score.dtype),
-        loss=jnp.zeros((), score.dtype),
-        bad_observations=jnp.sum(bad_observation, dtype=score.dtype),
-        bad_threats=jnp.sum(bad_threat, dtype=score.dtype),
-        bad_rewards=jnp.sum(~jnp.isfinite(taken.reward), dtype=score.dtype),
+        steps=jnp.asarray(batch, dtype),
+        **ended._asdict(),
+        insecure=jnp.sum(jnp.min(state.seen.threat, axis=-1) > pmdp.x, dtype=dtype),
+        inadmissible=jnp.sum(_inadmissible(state.seen.threat, action, pmdp.x), dtype=dtype),
+        loss=jnp.zeros((), dtype),
+        bad_observations=jnp.sum(bad_observation, dtype=dtype),
+        bad_threats=jnp.sum(bad_threat, dtype=dtype),
+        bad_rewards=jnp.sum(~jnp.isfinite(taken.reward), dtype=dtype),
     )
     window = jax.tree.map(
         lambda old, new: jnp.concatenate([old[1:], new[None]]), state.window, taken
     )
-    state = state._replace(
-        states=carried[0],
-        seen=carried[1],
-        score=jnp.where(outcome.done, 0.0, score),
-        danger=jnp.where(outcome.done, 0.0, danger),
-        window=window,
-    )
+    state = state._replace(states=carried[0], seen=carried[1], running=running, window=window)
     return state, metrics
 
 
@@ -249,8 +239,7 @@ def begin(key: Array, pmdp: PMDP, config: LoopConfig) -> LoopState:
     return LoopState(
         states=states,
         seen=seen,
-        score=zeros,
-        danger=zeros,
+        running=base.Running(zeros, zeros),
         window=window,
         learner=dqn.init(net_key, network, make_optimiser(config), encoded),
         replay=replay.init(jax.tree.map(lambda a: a[0], example)),
@@ -341,7 +330,7 @@ def chunk(
         state, loss = jax.lax.fori_loop(0, updates, update, start)
         return state, jax.tree.map(jnp.add, sums, metrics._replace(loss=loss))
 
-    nothing = Metrics(*[jnp.zeros((), state.score.dtype)] * len(Metrics._fields))
+    nothing = Metrics(*[jnp.zeros((), state.running.score.dtype)] * len(Metrics._fields))
     return jax.lax.fori_loop(0, iterations, iteration, (state, nothing))
 
 

@@ -9,6 +9,7 @@ import pytest
 from quick import unoptimised
 
 from rp_jax import evaluate
+from rp_jax.envs import base
 from rp_jax.planning import loop
 from rp_jax.planning.dqn import DQNConfig
 from rp_jax.planning.loop import LoopConfig
@@ -258,6 +259,7 @@ def test_no_key_is_used_twice(monkeypatch):
     monkeypatch.setattr(loop, "interact", act)
     monkeypatch.setattr(loop, "learn", learn)
     blank = dict.fromkeys(loop.LoopState._fields, jnp.zeros(()))
+    blank["running"] = base.Running(jnp.zeros(()), jnp.zeros(()))
     state = loop.LoopState(**{**blank, "key": jax.random.key(0)})
     with jax.disable_jit():
         loop.chunk(state, None, dataclasses.replace(CONFIG, updates=2), 5)
