@@ -133,6 +133,15 @@ def test_ctrl_c_finishes_the_step_and_says_where_it_is(kept, said, monkeypatch):
     assert said[-1] == "loop: 4 of 5 were done"
 
 
+@pytest.fixture
+def ctrl_c():
+    """It interrupts, also where the tests run in the background of a shell, which ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_twice_stops_at_once(kept):
     def interrupted(i, carried):
         signal.raise_signal(signal.SIGINT)
