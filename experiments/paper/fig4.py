@@ -29,10 +29,9 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
 
 def tell(results: list[dict[str, Any]]) -> Section:
     """How well the threat is known."""
-    lines = [errors(row) for row in results]
     return Section(
         "Threats were learned in sub-R-MDPs with one hazard; sums are upper bounds (Theorem 3).",
-        tables=[Table(ERRORS, lines)],
+        tables=[Table(ERRORS, [errors(row) for row in results])],
         figures={Path(name).name: caption for name, caption in PICTURES.items()},
     )
 

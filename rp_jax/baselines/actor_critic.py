@@ -274,8 +274,10 @@ def collect(
     target = advantage + steps.value
     batch = Batch(steps.encoded, steps.elapsed, steps.action, advantage, target)
     batch = jax.tree.map(lambda a: a.reshape(config.steps, *a.shape[2:]), batch)
-    state = state._replace(states=states, spread=spread, recent=recent)
-    return state._replace(running=running, earned=earned), batch, metrics
+    state = state._replace(
+        states=states, running=running, earned=earned, spread=spread, recent=recent
+    )
+    return state, batch, metrics
 
 
 def update_critic(state: State, batch: Batch, pmdp: PMDP, config: ActorCriticConfig) -> State:

@@ -259,8 +259,8 @@ def test_no_key_is_used_twice(monkeypatch):
     monkeypatch.setattr(loop, "interact", act)
     monkeypatch.setattr(loop, "learn", learn)
     blank = dict.fromkeys(loop.LoopState._fields, jnp.zeros(()))
-    blank["running"] = base.Running(jnp.zeros(()), jnp.zeros(()))
-    state = loop.LoopState(**{**blank, "key": jax.random.key(0)})
+    running = base.Running(jnp.zeros(()), jnp.zeros(()))
+    state = loop.LoopState(**{**blank, "running": running, "key": jax.random.key(0)})
     with jax.disable_jit():
         loop.chunk(state, None, dataclasses.replace(CONFIG, updates=2), 5)
     assert len(used) == 5 * 3
