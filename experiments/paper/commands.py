@@ -3,6 +3,10 @@
 A word that begins with @ is a file of another run, which is made first.
 """
 
+_AHEAD = (
+    "{jam_steps} --baseline plans --x 0.002 --lookahead 8 --learning-toll 1 --learning-penalty 50"
+    " --fewest-obstacles 0 --threat @jam_plans/threat --no-figures"
+)
 COMMANDS: dict[str, str] = {
     "frozen_lake": "frozen_lake --no-figures {frozen_lake}",
     "theorems": "theorems --instances {instances}",
@@ -16,9 +20,8 @@ COMMANDS: dict[str, str] = {
     "circuit_plans": "circuit {seeds} {circuit_steps} --baseline plans --lost 0.1",
     "jam_plans": "jam {seeds} {jam_steps} {obstacle} --baseline plans --x 0.001 --learning-toll 1"
     " --learning-penalty 50 --test-obstacles 3 8 15 30 50",
-    "jam_ahead": "jam {few} {jam_steps} --baseline plans --x 0.002 --lookahead 8 --learning-toll 1"
-    " --learning-penalty 50 --fewest-obstacles 0 --threat @jam_plans/threat"
-    " --test-obstacles 3 8 15 30 50 --no-figures",
+    "jam_ahead": f"jam {{seeds}} {_AHEAD} --test-obstacles 3 8 15",
+    "jam_ahead_crowds": f"jam {{few}} {_AHEAD} --test-obstacles 30 50",  # slow
     # As many steps as the paper's returns need (benchmarks.to_return).
     "circuit_brief": "circuit {brief} {circuit_brief} --baseline plans --lost 0.1 --no-figures",
     "jam_brief": "jam {brief} {jam_brief} {wall} {obstacle} --no-figures",

@@ -8,11 +8,12 @@ from experiments.paper.section import Section
 
 TITLE = "Crowds: Jam among 30 and 50 obstacles"
 VARIANTS = ("N=30", "N=50")
+RUNS = scores.RUNS["jam"] | {scores.AHEAD: "jam_ahead_crowds"}
 
 
 def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
     """A row per kind of RP, number of obstacles and seed."""
-    rows = scores.by_kind(sources, "jam")
+    rows = scores.by_kind(sources, RUNS)
     return [row for row in rows if row["variant"] in VARIANTS]
 
 

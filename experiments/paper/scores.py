@@ -36,18 +36,18 @@ def named(rows: Sequence[Row], method: str) -> list[Row]:
     return [{**row, "method": method} for row in rows]
 
 
-def by_kind(sources: Any, env: str) -> list[Row]:
-    """One row per kind of RP, variant and seed."""
+def by_kind(sources: Any, runs: Mapping[str, str]) -> list[Row]:
+    """One row per kind of RP, variant and seed, of the runs of each kind."""
     return [
         row
-        for method, name in RUNS[env].items()
+        for method, name in runs.items()
         for row in named(read(sources(name) / "table.json"), method)
     ]
 
 
 def collect(sources: Any, env: str, searches: Sequence[int]) -> list[Row]:
     """One row per method, variant and seed: RP, the methods compared with, MPC."""
-    rows = by_kind(sources, env)
+    rows = by_kind(sources, RUNS[env])
     rows += evaluated(sources, env)
     for steps in searches:
         rows += read(sources(f"mpc_{env}_{steps}") / "table.json")
