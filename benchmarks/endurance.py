@@ -51,10 +51,12 @@ def train(config: Config) -> Iterator[dict[str, float]]:
 
     Raises:
         FloatingPointError: something is no longer a finite number.
+        ValueError: there are fewer steps than environments.
     """
     task, settings = setups.quick_tasks()[config.env]
-    pmdp = setups.pmdp_of(task, settings)
     learning = dataclasses.replace(settings.planning, steps=config.steps)
+    learning.validate("planning")
+    pmdp = setups.pmdp_of(task, settings)
     traces = 0
 
     def counted(state: loop.LoopState, pmdp: PMDP) -> tuple[loop.LoopState, loop.Metrics]:

@@ -26,8 +26,6 @@ from experiments.runs import EXPERIMENTS
 from rp_jax import storage
 from rp_jax.validate import number, one_of
 
-LEARNED_ON = {"circuit": "default", "jam": "N=8"}
-
 
 @dataclass(frozen=True)
 class Config:
@@ -50,7 +48,7 @@ def prepare(config: Config) -> tuple[Any, tasks.Task]:
     Raises:
         ValueError: a setting is out of range.
     """
-    module = EXPERIMENTS[one_of("env", config.env, LEARNED_ON)]
+    module = EXPERIMENTS[one_of("env", config.env, published.SCORES)]
     number("seeds", config.seeds, least=1, integer=True)
     quick = module.quick("tuned")
     settings = dataclasses.replace(
@@ -61,10 +59,12 @@ def prepare(config: Config) -> tuple[Any, tasks.Task]:
         episodes=config.episodes,
         figures=False,
     )
+    if not config.budgets:
+        raise ValueError("budgets is (); it must have at least one value")
     for budget in config.budgets:
         dataclasses.replace(settings.planning, steps=budget).validate("budgets")
     task = pipeline.checked(module.make_task, settings)
-    variant = LEARNED_ON[config.env]
+    variant = published.LEARNED_ON[config.env]
     return settings, task._replace(tests={variant: task.tests[variant]})
 
 
@@ -90,7 +90,7 @@ def run(config: Config, settings: Any, task: tasks.Task) -> dict[str, Any]:
 
 def show(found: dict[str, Any], env: str) -> None:
     """A line per budget, and the first of them that all seeds pass with."""
-    (wanted, rate), lines, passed = published.SCORES[env][LEARNED_ON[env]][RP], [], []
+    (wanted, rate), lines, passed = published.SCORES[env][published.LEARNED_ON[env]][RP], [], []
     most = rate + HALF_A_DIGIT  # it was rounded
     for budget in dict.fromkeys(row["budget"] for row in found["rows"]):
         rows = [row for row in found["rows"] if row["budget"] == budget]

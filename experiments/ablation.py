@@ -34,8 +34,7 @@ def at_random(
 
     @jax.jit
     def play(pmdp: Any) -> evaluate.Episodes:
-        batch = min(1000, config.episodes)
-        return evaluate.play_episodes(key, pmdp, policy, config.episodes, batch=batch)
+        return evaluate.play_episodes(key, pmdp, policy, config.episodes)
 
     rows = []
     for variant, params in task.tests.items():

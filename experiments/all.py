@@ -80,7 +80,7 @@ def begun(config: Config) -> tuple[str, Path]:
     """
     for name in config.only:
         one_of("only", name, [*RESULTS, *COMMANDS])
-    cli.needs_matplotlib(True)
+    cli.needs_matplotlib()
     if config.resume is None:
         preset = one_of("preset", config.preset or "quick", SIZES)
         folder = storage.new_folder(config.out or pipeline.default_out("paper", preset))
@@ -161,7 +161,8 @@ def blocks(folder: Path, preset: str, failed: dict[str, str]) -> list[report.Blo
     versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
     out: list[report.Block] = [
         report.Heading("The paper's figures and tables, and more", 1),
-        f"Preset {preset}; report by {versions}, {os.cpu_count()} cores, {machine['device']}. "
+        f"Preset {preset}; report by {versions}, {os.cpu_count()} cores, {machine['device']}; "
+        "what was run for it, at the end. "
         "Crash rates have 95 % intervals of Clopper and Pearson, over the episodes of all seeds "
         "pooled; returns, Student's over seeds, or over episodes where there is one seed.",
         f"{len(claims)} verdicts: "

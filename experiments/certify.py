@@ -52,7 +52,7 @@ def run(config: Config) -> dict[str, Any]:
 
     @functools.partial(jax.jit, static_argnames="episodes")
     def play(key, params, pmdp, episodes):
-        values = evaluate.greedy(network, params)
+        values = evaluate.action_values(network, params)
         return evaluate.run_episodes(key, pmdp, values, episodes, batch=episodes)
 
     key = tasks.key_of(config.seed, tasks.CERTIFICATE)

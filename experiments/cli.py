@@ -17,6 +17,8 @@ from rp_jax import storage
 from rp_jax.checkpoints import Checkpoints
 from rp_jax.validate import one_of
 
+NO_FIGURES = ", or say --no-figures"
+
 
 def main(
     name: str,
@@ -57,7 +59,7 @@ def main(
                 prog=f"python -m {name}",
                 description=_description(about, presets),
             )
-            needs_matplotlib(config.figures)
+            needs_matplotlib(config.figures, NO_FIGURES)
             task, folder = pipeline.prepare(make_task, config, chosen.preset)
             plain = {"preset": chosen.preset, "task": task.name, **dataclasses.asdict(config)}
             checkpoints = settings.begin(folder, name, plain)
@@ -85,7 +87,7 @@ def resumed(name: str, folder: Path, kind: type, argv: Sequence[str]) -> tuple[A
     Raises:
         ValueError: there are other arguments, or the run cannot be resumed by this module.
     """
-    if list(argv) not in (["--resume", str(folder)], [f"--resume={folder}"]):
+    if len(argv) > (2 if argv[0] == "--resume" else 1):  # --resume DIR, --resume=DIR
         raise ValueError(
             f"resume is {folder}; no other option may be given with it: the settings are those in "
             "its config.json"
@@ -127,12 +129,10 @@ def _description(about: str, presets: Mapping[str, Any]) -> str:
     )
 
 
-def needs_matplotlib(figures: bool) -> None:
-    """Raises ValueError if figures are asked for and cannot be drawn."""
+def needs_matplotlib(figures: bool = True, otherwise: str = "") -> None:
+    """Raises ValueError if figures are drawn and cannot be; `otherwise` says how to do without."""
     if figures and importlib.util.find_spec("matplotlib") is None:
-        raise ValueError(
-            "figures is True; it needs matplotlib (pip install 'rp_jax[plot]'), or say --no-figures"
-        )
+        raise ValueError(f"figures need matplotlib (pip install 'rp_jax[plot]'){otherwise}")
 
 
 def needs_folder(out: Path | None) -> None:

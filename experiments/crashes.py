@@ -116,13 +116,14 @@ def looked_at(
     Args:
         key: of the episodes that go on from there.
         crash: what happened.
-        explore: (key, state, action) -> (best action, risk of it, risk of `action`).
+        explore: (key, state, action) -> (best action, what it seems to save, its risk, that of
+            `action`).
         config: sizes.
     """
     rows, n = [], config.checks
     for t, action in enumerate(crash.action):
         state = jax.tree.map(lambda a, t=t: a[t], crash.states)
-        best, of_best, of_own = explore(jax.random.fold_in(key, t), state, action)
+        best, saves, of_best, of_own = explore(jax.random.fold_in(key, t), state, action)
         rows.append(
             {
                 "before": len(crash.action) - t,
@@ -132,6 +133,7 @@ def looked_at(
                 "risk": float(of_own),
                 "risk_ci95": list(statistics.clopper_pearson(round(float(of_own) * n), n)),
                 "best_action": int(best),
+                "seems_to_save": float(saves),
                 "best_risk": float(of_best),
                 "best_risk_ci95": list(statistics.clopper_pearson(round(float(of_best) * n), n)),
             }
@@ -140,10 +142,10 @@ def looked_at(
 
 
 def explorer(pmdp: PMDP, values: rare.Values, config: Config) -> Callable[..., Any]:
-    """(key, state, action) -> (best action, its risk, that of `action`), compiled.
+    """(key, state, action) -> (best action, what it seems to save, its risk, that of `action`).
 
-    The best action is chosen by some episodes and judged by others: the least of many estimates is
-    too low.
+    Compiled. The best action is chosen by some episodes and judged by others: the least of many
+    estimates is too low.
     """
     actions = jnp.arange(pmdp.env.num_actions(pmdp.params))
 
@@ -154,7 +156,7 @@ def explorer(pmdp: PMDP, values: rare.Values, config: Config) -> Callable[..., A
         tried = rare.risks(first, one, actions[None], pmdp, values, config.tries)[0]
         pair = jnp.stack([jnp.argmin(tried), action])
         risk = rare.risks(second, one, pair[None], pmdp, values, config.checks)[0]
-        return pair[0], risk[0], risk[1]
+        return pair[0], tried[action] - jnp.min(tried), risk[0], risk[1]
 
     return lambda key, state, action: explore(key, state, action, pmdp)
 
@@ -163,11 +165,12 @@ def summed_up(rows: list[dict[str, Any]], insecure: int) -> dict[str, Any]:
     """What a crash comes down to.
 
     `entered` is the risk of the last admissible action, before the steps in which there was none
-    (None where that is further back than the steps looked at); `missed` the step at which the best
-    action would have taken most off the risk, and by how much.
+    (None where that is further back than the steps looked at); `missed` what the best action would
+    have taken off the risk, at the step at which that seemed most by the episodes that chose it:
+    those that judge it have no say in the step, for the greatest of many estimates is too high.
     """
     last = [row for row in rows if row["before"] == insecure + 1 and row["secure"]]
-    most = max(rows, key=lambda row: row["risk"] - row["best_risk"])
+    most = max(rows, key=lambda row: row["seems_to_save"])
     return {
         "entered": last[0]["risk"] if last else None,
         "missed_before": most["before"],
@@ -178,7 +181,7 @@ def summed_up(rows: list[dict[str, Any]], insecure: int) -> dict[str, Any]:
 def run(config: Config, loaded: runs.Run, folder: Path) -> dict[str, Any]:
     """Writes crashes.json, kept up to date, and the figure."""
     variant, pmdp, network, weights = loaded.subject(config.variant, config.agent)
-    values = evaluate.greedy(network, weights)
+    values = evaluate.action_values(network, weights)
     find, look = jax.random.split(tasks.key_of(config.seed, tasks.CRASHES))
     crashes, count, episodes = found(find, pmdp, values, config)
     result: dict[str, Any] = {
@@ -245,7 +248,7 @@ def main() -> None:
     config = tyro.cli(Config, description=__doc__)
     with cli.bad_input():
         config.validate()
-        cli.needs_matplotlib(config.figures)
+        cli.needs_matplotlib(config.figures, cli.NO_FIGURES)
         loaded = runs.load(config.run)
         loaded.subject(config.variant, config.agent)
         folder = storage.new_folder(config.out)

@@ -35,7 +35,13 @@ def play(
     weights = jax.tree.map(lambda a: a[0], run.trained.params)
     key = key_of(run.config.seed, MEDIA)
     return recorded(
-        key, pmdp, starts, steps, functools.partial(evaluate.greedy, network), weights, obstacles
+        key,
+        pmdp,
+        starts,
+        steps,
+        functools.partial(evaluate.action_values, network),
+        weights,
+        obstacles,
     )
 
 
@@ -44,7 +50,7 @@ def recorded(
     pmdp: PMDP,
     starts: Any,
     steps: int,
-    policy: Callable[[Any], Callable[[Percept], jax.Array]],
+    values: Callable[[Any], Callable[[Percept], jax.Array]],
     weights: Any,
     obstacles: Callable[[Any], Vehicle] | None = None,
 ) -> list[scenes.Episode]:
@@ -55,7 +61,7 @@ def recorded(
         pmdp: the environment, and what is admissible.
         starts: states (n,).
         steps: of an episode, at most.
-        policy: from `weights` to scores of the actions.
+        values: from `weights` to scores of the actions.
         weights: a pytree of arrays.
         obstacles: finds what else is drawn in a batch of states.
     """
@@ -64,7 +70,7 @@ def recorded(
 
     @jax.jit
     def go(key, pmdp, weights, starts):
-        return evaluate.record(key, pmdp, policy(weights), starts, rows)
+        return evaluate.record(key, pmdp, values(weights), starts, rows)
 
     shown = jax.tree.map(np.asarray, go(key, pmdp, weights, starts))
     count = shown.alive.shape[1]
@@ -113,7 +119,7 @@ def threat_of_one(
     panels = []
     for i, title in enumerate(titles):
         features = jnp.asarray(make(grid.reshape(-1, 2), i), jnp.float32)
-        threat = np.asarray(jax.jit(predict)(model, features)).min(axis=-1)
+        threat = np.asarray(predict(model, features)).min(axis=-1)
         extent = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
         panels.append(maps.Panel(title, threat.reshape(grid.shape[:2]), extent))
     return panels

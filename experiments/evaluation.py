@@ -108,7 +108,7 @@ def play_all(
 
 def greedily(network: nn.Module) -> Callable[[Any], evaluate.Policy]:
     """The policy of a Q-network's weights: greedy inside the admissible set."""
-    return lambda weights: evaluate.shielded(evaluate.greedy(network, weights))
+    return lambda weights: evaluate.shielded(evaluate.action_values(network, weights))
 
 
 def acting(

@@ -43,8 +43,9 @@ class Config:
                 raise ValueError(f"{name} is (); it must have at least one value")
         for horizon in self.horizons:
             number("horizons", horizon, least=1, most=1000, integer=True)
-        for c in (*self.c, *self.curve):
-            number("c", c, least=0)
+        for name in ("c", "curve"):
+            for c in getattr(self, name):
+                number(name, c, least=0)
         number("slip", self.slip, least=0, most=1)
 
 
@@ -232,7 +233,7 @@ def main() -> None:
     config = tyro.cli(Config, description=__doc__)
     with cli.bad_input():
         config.validate()
-        cli.needs_matplotlib(config.figures)
+        cli.needs_matplotlib(config.figures, cli.NO_FIGURES)
         folder = storage.new_folder(config.out or pipeline.default_out("frozen_lake", "exact"))
     with jax.enable_x64(True):
         results = run(config)

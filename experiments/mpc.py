@@ -80,7 +80,7 @@ def play(
     size = min(GROUP, episodes)
 
     def group(key: jax.Array, pmdp: mpc.Omniscient, search: mpc.Search) -> evaluate.Episodes:
-        return evaluate.run_episodes(key, pmdp, mpc.policy(search), size, batch=size)
+        return evaluate.run_episodes(key, pmdp, mpc.values(search), size, batch=size)
 
     bar("", 0, episodes, "compiling")
     run = jax.jit(group).lower(key, pmdp, search).compile()

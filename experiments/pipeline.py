@@ -32,8 +32,8 @@ class Finished(NamedTuple):
 
 
 def default_out(task: str, preset: str) -> Path:
-    """results/TASK-PRESET-TIME."""
-    now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    """results/TASK-PRESET-TIME, the time in microseconds."""
+    now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S-%f")
     return Path("results") / f"{task}-{preset}-{now}"
 
 

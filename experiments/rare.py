@@ -82,7 +82,7 @@ def estimates(key: jax.Array, subject: Subject, config: Config) -> tuple[dict[st
     with console.progress("plain episodes") as bar:
         while played < steps:
             start, play = jax.random.split(jax.random.fold_in(plain_key, n))
-            paths = stage(play, rare.begin(start, pmdp, config.particles), pmdp, np.float32(np.inf))
+            paths = stage(play, rare.begin(start, pmdp, config.particles), pmdp, np.inf)
             n, k = n + config.particles, k + int(paths.crashed.sum())
             played += int(paths.length.sum())
             bar("", min(played, steps), steps, f"{k} crashes of {n:,}")
@@ -114,7 +114,7 @@ def crashes_from(key: jax.Array, subject: Subject, starts: Any, tries: int) -> n
     for i, done in enumerate(range(0, tries, block)):
         paths = rare.from_starts(many, subject.pmdp)
         this = jax.random.fold_in(key, i)
-        crashed = subject.stage(this, paths, subject.pmdp, np.float32(np.inf)).crashed
+        crashed = subject.stage(this, paths, subject.pmdp, np.inf).crashed
         total += np.asarray(crashed).reshape(count, block)[:, : tries - done].sum(axis=1)
     return total
 
@@ -178,8 +178,6 @@ def worst_starts(key: jax.Array, subject: Subject, first: Any, config: Config) -
             note = f"the worst {elite} crash in {100 * crashes[order].mean() / config.tries:.1f} %"
             bar("", i + 1, config.generations, note)
             best = jax.tree.map(lambda a, order=order: a[order], starts)
-            if i == config.generations - 1:
-                return jax.tree.map(lambda a: a[: config.kept], best)
             fresh = draw(fresh_key)
             chosen = jax.random.randint(parent_key, (size,), 0, len(order))
             parents = jax.tree.map(lambda a, chosen=chosen: a[chosen], best)
@@ -187,7 +185,7 @@ def worst_starts(key: jax.Array, subject: Subject, first: Any, config: Config) -
             more = size - len(order)
             children = jax.tree.map(lambda a, more=more: a[:more], children)
             starts = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), best, children)
-    return jax.tree.map(lambda a: a[: config.kept], starts)
+    return jax.tree.map(lambda a: a[: config.kept], best)
 
 
 def known_starts(folder: Path, pmdp: PMDP, about: dict[str, Any]) -> Any:
@@ -221,7 +219,7 @@ def run(config: Config, loaded: runs.Run, folder: Path) -> dict[str, Any]:
     """Writes rare.json and, after a search, the folder worst_starts."""
     (_, pmdp, network, weights), about, known = chosen(config, loaded)
     row: dict[str, Any] = {**about, "seed": config.seed}
-    values = evaluate.greedy(network, weights)
+    values = evaluate.action_values(network, weights)
     subject = Subject(pmdp, values, rare.compiled(values))
     key, search, check = jax.random.split(tasks.key_of(config.seed, tasks.RARE), 3)
     if known is None:

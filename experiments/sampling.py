@@ -128,7 +128,7 @@ def main() -> None:
     config = tyro.cli(Config, description=__doc__)
     with cli.bad_input():
         config.validate()
-        cli.needs_matplotlib(True)
+        cli.needs_matplotlib()
         folder = storage.new_folder(config.out)
     with cli.bad_input():
         rows = run(config)

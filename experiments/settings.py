@@ -50,16 +50,24 @@ def code(experiment: str) -> str:
         found = None
     if found and found.origin and Path(found.origin).parent != here:
         files += sorted(Path(found.origin).parent.glob("*.py"))
+    drawn = {here / name for name in DRAWN}
     digest = hashlib.sha256()
     for file in files:
-        if "plot" not in file.parts and file.name not in DRAWN:
+        if file not in drawn and not file.is_relative_to(library / "plot"):
             digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
 
 
 def begin(folder: Path, experiment: str, settings: Mapping[str, Any]) -> Checkpoints:
-    """Writes config.json of a new run of an experiment."""
-    (folder / CHECKPOINTS).mkdir()
+    """Writes config.json of a new run of an experiment.
+
+    Raises:
+        storage.StorageError: another process has just begun one there.
+    """
+    try:
+        (folder / CHECKPOINTS).mkdir()
+    except FileExistsError:
+        raise storage.StorageError(f"out is {folder}; another run has begun there") from None
     plain = {"experiment": experiment, **settings, **machine(experiment)}
     storage.write_json(folder / "config.json", plain)
     return checkpoints_of(folder)

@@ -104,10 +104,8 @@ def played(key: jax.Array, pmdp: PMDP, weights: Any, policy: Policy, discrete: b
         env = brax.Shielded(env, threat, pmdp.x, policy.table)
     start_key, act_key = jax.random.split(key)
     state = env.reset(jax.random.split(start_key, ROUND))
-    none, zeros = jnp.zeros(ROUND, bool), jnp.zeros(ROUND)
-    kinds = jax.eval_shape(jax.vmap(pmdp.env.causes, (0, None)), state.pipeline_state, pmdp.params)
-    causes = dict.fromkeys(kinds, none)
-    rows = evaluate.Episodes(zeros, zeros, none, zeros, zeros, zeros, causes, zeros, zeros)
+    rows = evaluate.blank(pmdp.env, state.pipeline_state, pmdp.params)
+    never = jnp.zeros(ROUND)
 
     def advance(carry):
         t, alive, state, rows = carry
@@ -115,21 +113,21 @@ def played(key: jax.Array, pmdp: PMDP, weights: Any, policy: Policy, discrete: b
         reached = env.step(state, action)
         hit = jax.vmap(pmdp.env.causes, (0, None))(reached.pipeline_state, pmdp.params)
         new = evaluate.Episodes(
-            score=rows.score + reached.reward,
-            danger=rows.danger + reached.info["cost"],
+            score=reached.reward,
+            danger=reached.info["cost"],
             goal=reached.metrics["goal"] > 0,
-            length=rows.length + 1,
-            interventions=rows.interventions + reached.info.get("intervention", 0.0),
-            insecure=rows.insecure + reached.info.get("insecure", 0.0),
-            causes=jax.tree.map(jnp.logical_or, rows.causes, hit),
-            bad_observations=rows.bad_observations + not_finite(state.obs),
-            bad_threats=rows.bad_threats,  # the shield's own
+            length=alive,
+            interventions=reached.info.get("intervention", never) > 0,
+            insecure=reached.info.get("insecure", never) > 0,
+            causes=hit,
+            bad_observations=not_finite(state.obs),
+            bad_threats=never > 0,  # the shield's own
         )
-        keep = jax.vmap(select)
         ended = (reached.done + reached.info["truncation"]) > 0
-        return t + 1, alive & ~ended, keep(alive, reached, state), keep(alive, new, rows)
+        kept = jax.vmap(select)(alive, reached, state)
+        return t + 1, alive & ~ended, kept, evaluate.added(rows, new, alive)
 
-    carry = (jnp.asarray(0), ~none, state, rows)
+    carry = (jnp.asarray(0), jnp.ones(ROUND, bool), state, rows)
     return jax.lax.while_loop(lambda c: jnp.any(c[1]), advance, carry)[3]
 
 

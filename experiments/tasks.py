@@ -102,9 +102,9 @@ def make_pmdp(task: Task, config: Config, models: Mapping | None, params: Any) -
     return PMDP(
         params=params,
         threats=None if models is None else dict(models),
-        x=jnp.asarray(shield.rounded_down(config.x)),
-        penalty=jnp.asarray(config.learning_penalty, jnp.float32),
-        toll=jnp.asarray(config.learning_toll, jnp.float32),
+        x=jnp.asarray(shield.rounded_down(config.x), float),
+        penalty=jnp.asarray(config.learning_penalty, float),
+        toll=jnp.asarray(config.learning_toll, float),
         env=task.env,
         pool=POOLS[config.planning.network],
         lookahead=config.lookahead,
@@ -113,7 +113,7 @@ def make_pmdp(task: Task, config: Config, models: Mapping | None, params: Any) -
 
 def side_by_side(pmdp: PMDP, members: Sequence[Member]) -> tuple[PMDP, PMDP]:
     """The P-MDPs of all members, and the `in_axes` of a vmap over them."""
-    x = jnp.asarray(shield.rounded_down([member.x for member in members]))
-    penalty = jnp.asarray([member.learning_penalty for member in members], jnp.float32)
+    x = jnp.asarray(shield.rounded_down([member.x for member in members]), float)
+    penalty = jnp.asarray([member.learning_penalty for member in members], float)
     axes = pmdp.replace(params=None, threats=None, x=0, penalty=0, toll=None)
     return pmdp.replace(x=x, penalty=penalty), axes

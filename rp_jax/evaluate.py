@@ -1,4 +1,4 @@
-"""Evaluation: thousands of episodes in one jitted call, each from its own key."""
+"""Evaluation: thousands of episodes in one program, each from its own key. Callers jit."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ from flax import linen as nn
 from jax import Array
 
 from rp_jax import shield, statistics
-from rp_jax.envs.base import select
+from rp_jax.envs.base import Env, select
 from rp_jax.planning.pmdp import PMDP, Percept, faults
 from rp_jax.validate import finite, leading, none_bad, number, random_key
 
@@ -33,7 +33,7 @@ class Episodes(NamedTuple):
     bad_threats: Array  # likewise
 
 
-def greedy(network: nn.Module, weights: Any) -> Callable[[Percept], Array]:
+def action_values(network: nn.Module, weights: Any) -> Callable[[Percept], Array]:
     """Action values of a learned Q-network, (B, A)."""
     return lambda percept: jnp.asarray(network.apply(weights, percept.encoded))
 
@@ -65,7 +65,7 @@ def run_episodes(
         pmdp: the environment, the threats and the threshold.
         values: scores the actions of a batch of states.
         episodes: how many.
-        batch: episodes simulated side by side.
+        batch: episodes simulated side by side, at most.
 
     Returns:
         Rows with leading axis (episodes,).
@@ -87,6 +87,7 @@ def play_episodes(
     random_key("key", key)
     number("episodes", episodes, least=1, integer=True)
     number("batch", batch, least=1, integer=True)
+    batch = min(batch, episodes)
     keys = round_keys(key, episodes, batch)
     rows = jax.lax.map(lambda key: play_round(key, pmdp, policy, batch), keys)
     return jax.tree.map(lambda a: a.reshape(-1)[:episodes], rows)
@@ -103,12 +104,6 @@ def play_round(key: Array, pmdp: PMDP, policy: Policy, batch: int) -> Episodes:
     keys = jax.random.split(step_key, batch)
     starts = jax.random.split(start_key, batch)
     states = jax.vmap(pmdp.env.reset, (0, None))(starts, pmdp.params)
-    zeros = jnp.zeros(batch, pmdp.x.dtype)
-    none = jnp.zeros(batch, bool)
-    kinds = jax.eval_shape(jax.vmap(pmdp.env.causes, (0, None)), states, pmdp.params)
-    causes = dict.fromkeys(kinds, none)
-    count = jnp.zeros(batch, jnp.int32)
-    rows = Episodes(zeros, zeros, none, count, count, count, causes, count, count)
 
     def advance(carry):
         t, alive, states, rows = carry
@@ -120,21 +115,35 @@ def play_round(key: Array, pmdp: PMDP, policy: Policy, batch: int) -> Episodes:
         hit = jax.vmap(pmdp.env.causes, (0, None))(reached, pmdp.params)
         bad_observation, bad_threat = faults(percept.encoded, percept.threat)
         new = Episodes(
-            score=rows.score + outcome.reward,
-            danger=rows.danger + outcome.danger,
+            score=outcome.reward,
+            danger=outcome.danger,
             goal=outcome.goal,
-            length=rows.length + 1,
-            interventions=rows.interventions + changed,
-            insecure=rows.insecure + ~percept.secure,
-            causes=jax.tree.map(jnp.logical_or, rows.causes, hit),
-            bad_observations=rows.bad_observations + bad_observation,
-            bad_threats=rows.bad_threats + bad_threat,
+            length=alive,
+            interventions=changed,
+            insecure=~percept.secure,
+            causes=hit,
+            bad_observations=bad_observation,
+            bad_threats=bad_threat,
         )
-        rows = jax.vmap(select)(alive, new, rows)
-        return t + 1, alive & ~outcome.done, reached, rows
+        return t + 1, alive & ~outcome.done, reached, added(rows, new, alive)
 
-    carry = (jnp.asarray(0), jnp.ones(batch, bool), states, rows)
+    carry = (jnp.asarray(0), jnp.ones(batch, bool), states, blank(pmdp.env, states, pmdp.params))
     return jax.lax.while_loop(lambda c: jnp.any(c[1]), advance, carry)[3]
+
+
+def blank(env: Env, states: Any, params: Any) -> Episodes:
+    """Of episodes (B,) that have not begun."""
+    none = jnp.zeros(states.time.shape, bool)
+    zero, count = none.astype(float), none.astype(jnp.int32)
+    kinds = jax.eval_shape(jax.vmap(env.causes, (0, None)), states, params)
+    causes = dict.fromkeys(kinds, none)
+    return Episodes(zero, zero, none, count, count, count, causes, count, count)
+
+
+def added(rows: Episodes, step: Episodes, alive: Array) -> Episodes:
+    """Counts what a `step` brought in the episodes that are `alive` (B,), in which it was made."""
+    sums = jax.tree.map(lambda a, b: a | b if a.dtype == bool else a + b, rows, step)
+    return jax.vmap(select)(alive, sums, rows)
 
 
 def check(rows: Episodes, name: str) -> None:
@@ -235,13 +244,14 @@ def visited_states(key: Array, pmdp: PMDP, count: int, steps: int = 30) -> Any:
 
     def step(carry, key):
         states, alive, t = carry
-        percept = pmdp.perceive(states)
+        walking = alive & (t < stop)
+        percept = pmdp.perceive(states, walking)
         pick, move = jax.random.split(key)
         action = jax.vmap(shield.masked_sample)(jax.random.split(pick, count), percept.admissible)
         keys = jax.random.split(move, count)
         move_all = jax.vmap(pmdp.env.step, (0, 0, 0, None))
         reached, outcome = move_all(keys, states, action, pmdp.params)
-        going = alive & (t < stop) & ~outcome.done
+        going = walking & ~outcome.done
         return (jax.vmap(select)(going, reached, states), going, t + 1), None
 
     begin = (starts, jnp.ones(count, bool), jnp.asarray(0))

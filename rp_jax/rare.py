@@ -7,6 +7,7 @@ Demers, Tuffin (2007), section 3.1: the product's mean is the crash probability 
 levels made beforehand.
 """
 
+import functools
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -37,8 +38,9 @@ class Paths(NamedTuple):
     bad: Array  # (B,) bool, an observation or a threat was nan or infinite on the way
 
 
+@functools.partial(jax.jit, static_argnames="count")
 def begin(key: Array, pmdp: PMDP, count: int) -> Paths:
-    """Fresh episodes."""
+    """Fresh episodes, (count,)."""
     states = jax.vmap(pmdp.env.reset, (0, None))(jax.random.split(key, count), pmdp.params)
     return from_starts(states, pmdp)
 
@@ -161,11 +163,11 @@ def splitting(
         raise ValueError(f"levels is {list(levels)}; they must ascend")
     stage = stage or compiled(values)
     start_key, key = jax.random.split(key)
-    paths = _begin(start_key, pmdp, particles)
+    paths = begin(start_key, pmdp, particles)
     rates, steps = [], 0
     for i, level in enumerate([*levels, np.inf]):
         play, pick = jax.random.split(jax.random.fold_in(key, i))
-        paths = stage(play, paths, pmdp, jnp.asarray(level, pmdp.x.dtype))
+        paths = stage(play, paths, pmdp, level)
         steps += int(paths.length.sum())
         rates.append(float(paths.reached.mean()))
         if rates[-1] == 0:
@@ -177,7 +179,6 @@ def splitting(
     return Splitting(float(np.prod(rates)), rates, steps, starts)
 
 
-_begin = jax.jit(begin, static_argnums=2)
 _resample = jax.jit(resample)
 
 
@@ -188,8 +189,8 @@ def compiled(values: Values) -> Callable[..., Paths]:
     """
     stage = jax.jit(lambda key, paths, pmdp, level: advance(key, paths, pmdp, values, level))
 
-    def checked(key: Array, paths: Paths, pmdp: PMDP, level: Array) -> Paths:
-        found = stage(key, paths, pmdp, level)
+    def checked(key: Array, paths: Paths, pmdp: PMDP, level: float) -> Paths:
+        found = stage(key, paths, pmdp, jnp.asarray(level, pmdp.x.dtype))
         if count := int(found.bad.sum()):
             raise FloatingPointError(
                 f"rare: observations or threats of {count:,} paths are nan or infinite"
@@ -215,17 +216,17 @@ def choose_levels(
     levels: list[float] = []
     steps = 0
     start_key, key = jax.random.split(key)
-    paths = _begin(start_key, pmdp, particles)
+    paths = begin(start_key, pmdp, particles)
     for i in range(MOST_LEVELS):
         look, play, pick = jax.random.split(jax.random.fold_in(key, i), 3)
-        seen = stage(look, paths, pmdp, jnp.asarray(np.inf, pmdp.x.dtype))
+        seen = stage(look, paths, pmdp, np.inf)
         steps += int(seen.length.sum())
         highest = np.where(np.asarray(seen.crashed), np.inf, np.asarray(seen.highest))
         level = float(np.quantile(highest, 1 - SHARE, method="lower"))
         if not (levels[-1] if levels else 0.0) < level < np.inf:
             break
         levels.append(level)
-        paths = stage(play, paths, pmdp, jnp.asarray(level, pmdp.x.dtype))
+        paths = stage(play, paths, pmdp, level)
         steps += int(paths.length.sum())
         if not bool(paths.reached.any()):
             break

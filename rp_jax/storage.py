@@ -97,9 +97,11 @@ def new_folder(path: Path) -> Path:
     """
     path = Path(path)
     try:
-        taken = path.exists() and (not path.is_dir() or any(path.iterdir()))
-        if not taken:
-            path.mkdir(parents=True, exist_ok=True)
+        taken = False
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            taken = not path.is_dir() or any(path.iterdir())
     except OSError as error:
         raise StorageError(f"out is {path}; it cannot be created ({error.strerror})") from error
     if taken:

@@ -223,7 +223,7 @@ def test_learned_values_are_those_of_the_network():
             return weights * encoded.rest[:, :1]
 
     percept = jax.jit(PROBE.perceive)(jax.vmap(probe.start_at)(jnp.asarray([2.0, 5.0])))
-    np.testing.assert_array_equal(evaluate.greedy(Net, 3.0)(percept), [[6.0], [15.0]])
+    np.testing.assert_array_equal(evaluate.action_values(Net, 3.0)(percept), [[6.0], [15.0]])
 
 
 @functools.cache

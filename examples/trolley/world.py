@@ -178,7 +178,7 @@ def make_params(carts: int = 6, *, time_limit: int = 150, horizon: int = 12) -> 
 
 
 def reset(key: Array, params: Params) -> State:
-    """The load swings a little in the near corner; carts are anywhere 1 m from it."""
+    """The load swings a little in the near corner; carts are at least 1.3 m from it."""
     swing, where, turn, fast = jax.random.split(key, 4)
     body = Body(
         q=jnp.concatenate([jnp.full(2, 0.3), 0.1 * jax.random.normal(swing, (2,))]),

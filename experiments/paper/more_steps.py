@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from experiments.paper import scores
+from experiments.paper import published, scores
 from experiments.paper.fig5 import TASKS, line
 from experiments.paper.section import Section, Table
 
@@ -13,13 +13,13 @@ TITLE = "More steps for the others"
 def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
     """A row per task, method and number of steps, over the seeds; RP with its own steps alone."""
     rows = []
-    for env, (variant, runs, _) in TASKS.items():
+    for env, (runs, _) in TASKS.items():
         found = [row for name in runs for row in scores.read(sources(name) / "table.json")]
         few = scores.evaluated(sources, env)
         many = scores.evaluated(lambda name: sources(f"long_{name}"), env)
         times = many[0]["training_steps"] / few[0]["training_steps"]
         for budget, of in (("as RP", found + few), (f"{times:.1f} times as many", many)):
-            here = [row for row in of if row["variant"] == variant]
+            here = [row for row in of if row["variant"] == published.LEARNED_ON[env]]
             rows += [{"env": env, "budget": budget, **row} for row in scores.summed_up(here)]
     return rows
 

@@ -103,6 +103,11 @@ def shown(row: Row) -> str:
     return f"{tables.earned(row)}; {tables.crashed(row)}: {tables.percent(row)} %"
 
 
+def said(known: published.Score) -> str:
+    """A published return and crash rate in words."""
+    return f"{known[0]:g} ({100 * known[1]:g} %)"
+
+
 def table(
     title: str, scores: Sequence[Row], paper: Mapping[str, Mapping[str, published.Score]]
 ) -> Table:
@@ -122,7 +127,7 @@ def table(
             }
             if paper:
                 known = paper.get(variant, {}).get(_plain(row["method"]))
-                line["paper: return (rate)"] = f"{known[0]:g} ({known[1]:g})" if known else ""
+                line["paper: return (crashes)"] = said(known) if known else ""
             lines.append(line)
     return Table(title, lines)
 
@@ -175,8 +180,7 @@ def entries(
         known = paper.get(row["variant"], {}).get("RP")
         if known and row["method"].startswith("RP"):
             claim = f"{where}, {row['variant']}: {row['method']}"
-            said = f"{known[0]:g} ({known[1]:g})"
-            found.append(Claim(claim, said, shown(row), verdict_on(row, known)))
+            found.append(Claim(claim, said(known), shown(row), verdict_on(row, known)))
     return found
 
 

@@ -8,7 +8,7 @@ from experiments.paper import published, scores
 from experiments.paper.fig5 import KEPT
 from experiments.paper.section import Claim, Section, holds
 
-LEARNED_ON = "N=8"
+LEARNED_ON = published.LEARNED_ON["jam"]
 TITLE = "A second reward: patrol instead of exit"
 
 

@@ -11,6 +11,8 @@ import numpy as np
 
 from experiments import console, evaluation, mpc, policy_gradient, runs, tasks
 from experiments.paper import published
+from experiments.paper.fig5 import TASKS
+from experiments.paper.published import LEARNED_ON
 from experiments.paper.scores import AHEAD, PLANS, RP, read
 from experiments.paper.section import EXCEEDED, MISSED, Claim, Section, Table, holds
 from rp_jax.baselines import actor_critic
@@ -19,13 +21,12 @@ from rp_jax.baselines.mpc import make_search
 from rp_jax.planning.pmdp import PMDP
 
 TITLE = "Computation time"
-SEARCHES = {"circuit": (3, 4, 5), "jam": (2, 3), "point_gather": (1, 2)}
+SEARCHES = {env: searches for env, (_, searches) in TASKS.items()}
 TIMED = {  # runs of RP
     "circuit": {RP: "circuit_lost", PLANS: "circuit_plans"},
     "jam": {RP: "jam", AHEAD: "jam_ahead"},
     "point_gather": {RP: "point_gather"},
 }
-VARIANTS = {"jam": "N=8"}  # elsewhere the first
 ROUNDS = 3
 STEPS = 3_000_000  # that the paper's agents learn in
 
@@ -42,8 +43,7 @@ def run(sources: Any, folder: Path) -> dict[str, Any]:
             for i, (method, timer) in enumerate(timers.items()):
                 bar("", i, len(timers), method)
                 seconds = [timer()[0] for _ in range(ROUNDS)]
-                variant = VARIANTS.get(env, next(iter(own[RP].task.tests)))
-                row = {"env": env, "variant": variant, "method": method}
+                row = {"env": env, "variant": LEARNED_ON[env], "method": method}
                 rows.append({**row, "seconds": seconds})
             bar("", len(timers), len(timers))
     return {"actions": rows, "learning": learning}
@@ -85,9 +85,9 @@ def timers_of(env: str, own: dict[str, runs.Run]) -> dict[str, Callable[[], tupl
         found[method] = functools.partial(time, key, pmdp.env, pmdp.params, act)
 
     for method, loaded in own.items():
-        subject = loaded.subject(VARIANTS.get(env, ""), 0)
+        subject = loaded.subject(LEARNED_ON[env], 0)
         add(method, subject.pmdp, evaluation.greedily(subject.network), subject.weights)
-    subject = own[RP].subject(VARIANTS.get(env, ""), 0)
+    subject = own[RP].subject(LEARNED_ON[env], 0)
     free = subject.pmdp.replace(threats=None, x=jnp.asarray(jnp.inf))
     add("DQN", free, evaluation.greedily(subject.network), subject.weights)
     actor: Any = actor_critic.make_actor(free, CPOConfig().rollout)

@@ -16,6 +16,7 @@ from rp_jax import shield
 from rp_jax.adapters import registry
 from rp_jax.adapters.quiet import quietly
 from rp_jax.envs import base
+from rp_jax.validate import number
 
 with quietly():
     from brax import envs
@@ -158,12 +159,13 @@ def wrap(
     Args:
         env: unbatched.
         episode_length: steps; a time limit of the environment's own counts where it is shorter.
-        action_repeat: steps under each action.
+        action_repeat: 1; a crash inside a repeated action would not be seen.
         randomization_fn: not supported.
 
     Raises:
-        ValueError: `randomization_fn` is given.
+        ValueError: `randomization_fn` is given, or `action_repeat` is not 1.
     """
+    number("action_repeat", action_repeat, least=1, most=1, integer=True)
     if randomization_fn is not None:
         raise ValueError("randomization_fn is given; it must be None: vary the parameters instead")
     limit = min(episode_length, getattr(env, "time_limit", episode_length))

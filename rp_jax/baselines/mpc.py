@@ -273,7 +273,7 @@ def drawn(state: Any, scores: Array) -> Array:
     Equal scores are frequent, and the first actions of a table have much in common. The lots are
     drawn from the state, so that a search has no key.
     """
-    place = jax.lax.bitcast_convert_type(state.agent.position, jnp.uint32)
+    place = jax.lax.bitcast_convert_type(state.agent.position.astype(jnp.float32), jnp.uint32)
     key = jax.random.key(LOTS)
     for part in (state.time, *place):
         key = jax.random.fold_in(key, part)
@@ -281,7 +281,7 @@ def drawn(state: Any, scores: Array) -> Array:
     return jnp.where(scores >= jnp.max(scores) - SAME, lots, 0.0)
 
 
-def policy(search: Search) -> Callable[[Percept], Array]:
+def values(search: Search) -> Callable[[Percept], Array]:
     """Prefers (B, A) the best actions, for `evaluate.run_episodes` with an `Omniscient`.
 
     States are searched one after another: memory is that of one, and none waits for a harder one.

@@ -141,6 +141,23 @@ def ranks(values: Array) -> Array:
     return jnp.sum(ahead, axis=-1)
 
 
+def packed(where: Array, chunk: int, spare: int) -> tuple[Array, Array]:
+    """((m,) int32 indices of the marked places in ascending order, () int32 how many these are).
+
+    Args:
+        where: (n,) bool.
+        chunk: m is n, rounded up to a multiple of it.
+        spare: what follows the indices.
+    """
+    count = where.shape[0]
+    size = -(-count // chunk) * chunk
+    rank = jnp.cumsum(where.astype(jnp.int32))
+    slot = jnp.where(where, rank - 1, size)
+    order = jnp.full(size, spare, jnp.int32)
+    order = order.at[slot].set(jnp.arange(count, dtype=jnp.int32), mode="drop")
+    return order, rank[-1]
+
+
 def renew(where: Array, rows: Any, make: Callable[[Array], Any], chunk: int = 16) -> Any:
     """Replaces the rows of a batch that are marked, computing only those.
 
@@ -151,12 +168,7 @@ def renew(where: Array, rows: Any, make: Callable[[Array], Any], chunk: int = 16
             as there are marked rows to make; an index of B marks a spare place.
         chunk: rows made at a time.
     """
-    batch = where.shape[0]
-    size = -(-batch // chunk) * chunk
-    rank = jnp.cumsum(where.astype(jnp.int32))
-    slot = jnp.where(where, rank - 1, size)
-    order = jnp.full(size, batch, jnp.int32)
-    order = order.at[slot].set(jnp.arange(batch, dtype=jnp.int32), mode="drop")
+    order, count = packed(where, chunk, where.shape[0])
 
     def some(carry):
         start, rows = carry
@@ -165,7 +177,7 @@ def renew(where: Array, rows: Any, make: Callable[[Array], Any], chunk: int = 16
         rows = jax.tree.map(lambda old, now: old.at[indices].set(now, mode="drop"), rows, new)
         return start + chunk, rows
 
-    return jax.lax.while_loop(lambda c: c[0] < rank[-1], some, (0, rows))[1]
+    return jax.lax.while_loop(lambda c: c[0] < count, some, (0, rows))[1]
 
 
 def step_and_renew(

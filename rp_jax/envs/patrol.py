@@ -44,7 +44,7 @@ def reset(key: Array, params: Params) -> State:
 def step(key: Array, state: State, action: Array, params: Params) -> tuple[State, base.Outcome]:
     """A step of Jam that earns 20 x the way made to the corner, 10 on arrival, and -.05.
 
-    Leaving through the exit ends the episode and earns nothing.
+    Leaving through the exit ends the episode; the way of that step counts, and nothing more.
     """
     reached, outcome = jam.step(key, state, action, params)
     corner = jnp.asarray(CORNERS, reached.agent.position.dtype)[state.aim]

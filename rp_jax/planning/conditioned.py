@@ -46,6 +46,11 @@ class Params(struct.PyTreeNode):
         """The agent model of the environment."""
         return self.inner.agent
 
+    @property
+    def time_limit(self) -> Array:
+        """() int32, steps of an episode at most."""
+        return self.inner.time_limit
+
 
 def make_params(inner: Any, low: float, high: float) -> Params:
     """Thresholds spread evenly over the orders of magnitude from `low` to `high`.

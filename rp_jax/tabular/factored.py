@@ -90,7 +90,7 @@ def sub_threats(model: Factored, policy: Array) -> list[Array]:
     return found
 
 
-def summed(model: Factored, threats: Sequence[Array]) -> Array:
+def summed(threats: Sequence[Array]) -> Array:
     """(H, S, A) sum of sub-threats at each joint state, the upper bound of Theorem 3."""
     total = threats[0][:, :, :1] * 0
     for one in threats:
@@ -111,7 +111,7 @@ def approximate(model: Factored, policy: Array, c: Array | float) -> tuple[Array
         x, by the certificate (negative: there is none for this c), and the plan.
     """
     cmdp = joint(model)
-    total = summed(model, sub_threats(model, policy))
+    total = summed(sub_threats(model, policy))
     x = certified(cmdp, total, c)
     return x, plan(cmdp, secure(total, x).admissible)
 

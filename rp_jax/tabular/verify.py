@@ -362,7 +362,7 @@ def theorem_3(model: factored.Factored, etas: Array, x: Array) -> Array:
     totals, broken = [], []
     for eta in etas:
         whole = threat.threat(cmdp, factored.lifted(model, eta)).action
-        totals.append(factored.summed(model, factored.sub_threats(model, eta)))
+        totals.append(factored.summed(factored.sub_threats(model, eta)))
         broken.append(jnp.max(whole - totals[-1]))
     least = jnp.minimum(*totals)
     for upper in (totals[0], least, looked_ahead(cmdp, least, x)):

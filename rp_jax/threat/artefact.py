@@ -1,5 +1,7 @@
 """A learned threat function as a file of its own, to be used again with other x, tracks, counts."""
 
+import dataclasses
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -36,7 +38,8 @@ def save(
         for kind, model in models.items()
     }
     tree = {kind: {"model": models[kind], "sub": subs[kind]} for kind in models}
-    facts = {"environment": environment, "networks": networks, **about}
+    statics = {kind: _statics(subs[kind]) for kind in models}
+    facts = {"environment": environment, "networks": networks, "statics": statics, **about}
     storage.save(folder, KIND, tree, facts)
 
 
@@ -56,6 +59,8 @@ def load(folder: Path, environment: str, subs: Mapping[str, SubRMDP]) -> dict[st
     if not isinstance(networks, dict) or set(networks) != set(subs):
         kinds = sorted(networks) if isinstance(networks, dict) else networks
         raise storage.StorageError(f"{folder}: hazards are {kinds}; they must be {sorted(subs)}")
+    for kind, sub in subs.items():
+        _same_statics(f"{folder}: {kind}", about.get("statics", {}), kind, sub)
     like = {
         kind: {"model": _blank(folder, kind, networks[kind], sub), "sub": sub}
         for kind, sub in subs.items()
@@ -70,6 +75,31 @@ def load(folder: Path, environment: str, subs: Mapping[str, SubRMDP]) -> dict[st
                     f"it must be {value.tolist()}"
                 )
     return {kind: tree[kind]["model"] for kind in subs}
+
+
+def _statics(part: Any, path: str = "") -> dict[str, str]:
+    """What a tree of dataclasses holds that is no array (a horizon, a body's model), by path."""
+    found: dict[str, str] = {}
+    for field in dataclasses.fields(part) if dataclasses.is_dataclass(part) else ():
+        value, name = getattr(part, field.name), path + field.name
+        if field.metadata.get("pytree_node", True):
+            found |= _statics(value, f"{name}/")
+        else:
+            found[name] = str(value)
+    return found
+
+
+def _same_statics(where: str, saved: Any, kind: str, sub: SubRMDP) -> None:
+    """Raises StorageError if something differs that was saved; earlier versions saved nothing."""
+    known = saved.get(kind, {}) if isinstance(saved, dict) else None
+    if not isinstance(known, dict):
+        raise storage.StorageError(f"{where}: statics is {known!r}; it must be a table")
+    for name, value in _statics(sub).items():
+        if (found := known.get(name, value)) != value:
+            shown, wanted = (textwrap.shorten(str(text), 80) for text in (found, value))
+            raise storage.StorageError(
+                f"{where}: {name} is {shown}; for this environment it must be {wanted}"
+            )
 
 
 def _blank(folder: Path, kind: str, facts: Any, sub: SubRMDP) -> ThreatModel:

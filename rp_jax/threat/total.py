@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rp_jax.envs.base import Hazards
+from rp_jax.envs.base import Hazards, packed
 from rp_jax.threat.model import ThreatModel
 
 CHUNK = 256  # rows per call of a network; fixed, so that no result depends on the batch
@@ -63,18 +63,12 @@ def _summed(model: ThreatModel, agents: Any, hazards: Hazards) -> Array:
     batch, n = inside.shape
     if n == 0:
         return jnp.zeros((batch, model.network.num_actions), features.dtype)
-    size = -(-batch * n // CHUNK) * CHUNK
-    flat = inside.reshape(-1)
-    rank = jnp.cumsum(flat.astype(jnp.int32))
-    count = rank[-1]
-    slot = jnp.where(flat, rank - 1, size)
-    origin = jnp.arange(batch * n, dtype=jnp.int32)
-    source = jnp.zeros(size, jnp.int32).at[slot].set(origin, mode="drop")
+    order, count = packed(inside.reshape(-1), CHUNK, 0)
     rows = features.reshape(batch * n, -1)
 
     def add_chunk(carry):
         start, total = carry
-        chosen = jax.lax.dynamic_slice(source, (start,), (CHUNK,))
+        chosen = jax.lax.dynamic_slice(order, (start,), (CHUNK,))
         threat = model(rows[chosen])
         real = start + jnp.arange(CHUNK) < count
         threat = jnp.where(real[:, None], threat, 0.0)

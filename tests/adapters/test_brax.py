@@ -249,6 +249,11 @@ def test_randomised_parameters_are_refused():
         brax.wrap(made("circuit"), 10, randomization_fn=lambda sys: sys)
 
 
+def test_repeated_actions_are_refused():
+    with pytest.raises(ValueError, match=r"^action_repeat is 2; it must be .*1"):
+        brax.wrap(made("circuit"), 10, action_repeat=2)
+
+
 def test_what_jax_took_away_is_back():
     assert callable(jax.device_put_replicated)
     copies = brax._device_put_replicated({"a": jnp.arange(3), "b": 2.0}, jax.devices()[:1])

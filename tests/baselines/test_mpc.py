@@ -220,7 +220,7 @@ def test_safe_sequences_come_before_all_others():
 def test_a_row_does_not_depend_on_its_batch():
     settings = {"num_obstacles": 3}
     search, states = search_of("jam", 2, **settings), driven("jam", 12, 11, **settings)
-    scores = jax.jit(lambda states, alive: mpc.policy(search)(percept(states, alive)))
+    scores = jax.jit(lambda states, alive: mpc.values(search)(percept(states, alive)))
     everyone = np.ones(states.time.shape, bool)
     together = np.asarray(scores(states, everyone))
     for i in (0, 5):
@@ -272,7 +272,7 @@ def test_parameters_and_penalties_need_no_new_program():
 def test_it_is_evaluated_as_any_policy():
     search = search_of("jam", 2, num_obstacles=3, time_limit=6)
     run = jax.jit(
-        lambda key, pmdp: evaluate.run_episodes(key, pmdp, mpc.policy(search), 8, batch=4)
+        lambda key, pmdp: evaluate.run_episodes(key, pmdp, mpc.values(search), 8, batch=4)
     )
     rows = run(jax.random.key(0), mpc.omniscient(search))
     assert rows.length.shape == (8,)

@@ -200,7 +200,7 @@ def test_figures_without_matplotlib_are_refused(refused, monkeypatch):
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name: None if name == "matplotlib" else find(name)
     )
-    refused("jam", says=("figures is True; it needs matplotlib", "--no-figures"))
+    refused("jam", says=("figures need matplotlib", "or say --no-figures"))
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -73,8 +73,9 @@ def test_what_was_risked_and_what_was_missed(tmp_path):
     assert low <= last["best_risk"] <= high
     told = crashes.summed_up(rows, crash.insecure)
     assert told["entered"] == last["risk"]  # the last step was admissible
-    best = max(row["risk"] - row["best_risk"] for row in rows)
-    assert told["missed"] == best
+    most = max(rows, key=lambda row: row["seems_to_save"])
+    assert told["missed"] == most["risk"] - most["best_risk"]
+    assert all(row["seems_to_save"] >= 0 for row in rows)
 
 
 def test_steps_without_an_admissible_action_are_counted(tmp_path):
@@ -93,12 +94,12 @@ def test_steps_without_an_admissible_action_are_counted(tmp_path):
     assert (crash.length, crash.insecure) == (4, 2)
     np.testing.assert_array_equal(crash.secure, [True, False, False])
     rows = [
-        {"before": 3, "secure": True, "risk": 0.4, "best_risk": 0.1},
-        {"before": 2, "secure": False, "risk": 0.6, "best_risk": 0.6},
-        {"before": 1, "secure": False, "risk": 0.9, "best_risk": 0.8},
+        {"before": 3, "secure": True, "risk": 0.4, "best_risk": 0.1, "seems_to_save": 0.2},
+        {"before": 2, "secure": False, "risk": 0.6, "best_risk": 0.6, "seems_to_save": 0.3},
+        {"before": 1, "secure": False, "risk": 0.9, "best_risk": 0.8, "seems_to_save": 0.25},
     ]
     told = crashes.summed_up(rows, 2)
-    assert told == {"entered": 0.4, "missed_before": 3, "missed": pytest.approx(0.3)}
+    assert told == {"entered": 0.4, "missed_before": 2, "missed": 0.0}  # chosen by other episodes
     assert crashes.summed_up(rows[1:], 2)["entered"] is None
 
 

@@ -69,9 +69,9 @@ def test_a_table_has_all_methods_beside_the_published_ones(sources, tmp_path):
     told = table1.tell(made("table1", sources, tmp_path / "table1"))
     rows = {(row["variant"], row["method"]): row for row in told.tables[0].rows}
     assert len(rows) == 3 * 9  # RP three times, three DQN, CPO, PID, MPC
-    assert rows["N=8", "RP"]["paper: return (rate)"] == "69.1 (0)"
-    assert rows["N=15", "MPC (3 steps)"]["paper: return (rate)"] == "36.6 (0.45)"
-    assert rows["N=8", "CPO"]["paper: return (rate)"] == ""
+    assert rows["N=8", "RP"]["paper: return (crashes)"] == "69.1 (0 %)"
+    assert rows["N=15", "MPC (3 steps)"]["paper: return (crashes)"] == "36.6 (45 %)"
+    assert rows["N=8", "CPO"]["paper: return (crashes)"] == ""
     assert rows["N=8", "RP"]["crashes"] == "8 of 800"
 
 

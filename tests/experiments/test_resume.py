@@ -46,6 +46,8 @@ def test_no_other_option_goes_with_it(begun, capsys):
 def test_what_is_no_interrupted_run_is_refused(begun, capsys, tmp_path):
     refused(capsys, "config.json: cannot be read", "--resume", tmp_path / "nowhere")
     (begun / "checkpoints").rmdir()
+    refused(capsys, "there are no checkpoints: it is finished", "--resume", f"{begun}/./")
+    refused(capsys, "there are no checkpoints: it is finished", f"--resume={begun}/")
     refused(capsys, "there are no checkpoints: it is finished", "--resume", begun)
 
 

@@ -71,7 +71,9 @@ def test_a_run_comes_back_with_the_agents_that_its_table_speaks_of(finished):
     table = json.loads((finished / "table.json").read_text())
 
     def one(key, params):
-        return evaluate.run_episodes(key, pmdp, evaluate.greedy(network, params), 16, batch=16)
+        return evaluate.run_episodes(
+            key, pmdp, evaluate.action_values(network, params), 16, batch=16
+        )
 
     keys = jax.numpy.stack([tasks.key_of(i, tasks.EVALUATION) for i in range(2)])
     rows = jax.jit(jax.vmap(one))(keys, run.params)

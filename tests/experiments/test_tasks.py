@@ -1,10 +1,13 @@
 import dataclasses
+import shutil
 import types
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
+import rp_jax
 from examples.crossing import run as crossing
 from examples.trolley import run as trolley
 from experiments import ablation, circuit, jam, patrol, pipeline, settings, tasks
@@ -142,4 +145,20 @@ def test_the_code_of_a_run_is_also_that_of_its_own_world(tmp_path, monkeypatch):
     (folder / "world.py").write_text("GRAVITY = 2")
     assert code("odd_world.run") != before
     assert code("experiments.jam") == code("experiments.mpc") == code("no.such.module")
+    (folder / "report.py").write_text("TALLY = 1")  # what is named like this is no drawing there
+    grown = code("odd_world.run")
+    (folder / "report.py").write_text("TALLY = 2")
+    assert code("odd_world.run") != grown
     assert code("examples.crossing.run") not in (code("experiments.jam"), before)
+
+
+def test_the_code_of_a_run_is_that_of_the_library_but_for_drawing(tmp_path, monkeypatch):
+    copy = tmp_path / "plot" / "rp_jax"  # a checkout in a folder of that name
+    shutil.copytree(Path(rp_jax.__file__).parent, copy)
+    monkeypatch.setattr(rp_jax, "__file__", str(copy / "__init__.py"))
+    code = settings.code.__wrapped__
+    before = code("experiments.jam")
+    (copy / "plot" / "curves.py").write_text("")
+    assert code("experiments.jam") == before
+    (copy / "threat" / "report.py").write_text("")
+    assert code("experiments.jam") != before

@@ -84,7 +84,7 @@ def play(method):
 
     @jax.jit
     def episodes(params, pmdp):
-        values = evaluate.greedy(network, params)
+        values = evaluate.action_values(network, params)
         return evaluate.run_episodes(jax.random.key(2), pmdp, values, 50, batch=50)
 
     return evaluate.summarise(episodes(state.learner.params, pmdp), 0.0)

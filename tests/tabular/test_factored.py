@@ -35,13 +35,13 @@ def test_lifted_policies_see_the_agent_only():
 def test_sums_are_taken_at_each_joint_state():
     model, eta = drawn(jax.random.key(2), 3, 2, 2, 3)
     one, two = factored.sub_threats(model, eta)
-    total = np.asarray(factored.summed(model, [one, two])).reshape(3, 3, 3, 3, 2)
+    total = np.asarray(factored.summed([one, two])).reshape(3, 3, 3, 3, 2)
     np.testing.assert_allclose(total, one[:, :, :, None] + two[:, :, None], atol=1e-14)
 
 
 def test_a_single_hazard_s_sum_is_its_threat():
     model, eta = drawn(jax.random.key(3), 3, 2, 1, 4)
-    total = factored.summed(model, factored.sub_threats(model, eta))
+    total = factored.summed(factored.sub_threats(model, eta))
     whole = threat.threat(factored.sub_rmdp(model, 0), factored.lifted(model, eta)).action
     np.testing.assert_array_equal(total, whole)
 
@@ -56,7 +56,7 @@ def test_hazards_that_never_meet_add_up_exactly():
     ]
     model = model.replace(hazards=apart)
     whole = threat.threat(factored.joint(model), factored.lifted(model, eta)).action
-    total = factored.summed(model, factored.sub_threats(model, eta))
+    total = factored.summed(factored.sub_threats(model, eta))
     np.testing.assert_allclose(whole, total, atol=1e-12)
 
 
@@ -81,7 +81,7 @@ def test_a_baseline_that_sees_the_obstacles_breaks_theorem_3():
         alone = factored.sub_rmdp(model, n)
         flee = jnp.eye(2)[jnp.asarray([0, 1 - n])]  # from its hazard; else action 0
         seen.append(threat.threat(alone, flee).action.reshape(2, 1, 2, 2))
-    total = factored.summed(model, seen)
+    total = factored.summed(seen)
     whole = threat.least_threat(factored.joint(model)).action
     both = 3  # the state in which both hazards are there
     assert float(whole[0, both].min()) == pytest.approx(2.0)
@@ -92,7 +92,7 @@ def test_algorithm_2_plans_inside_the_sum_s_sets():
     model, eta = drawn(jax.random.key(6), 3, 2, 2, 3)
     cmdp = factored.joint(model)
     np.testing.assert_array_equal(cmdp.reward, np.repeat(model.reward, 9, axis=0))
-    total = factored.summed(model, factored.sub_threats(model, eta))
+    total = factored.summed(factored.sub_threats(model, eta))
     c = float(cmdp.start @ total.min(-1)[0]) + 0.6
     x, planned = factored.approximate(model, eta, c)
     beta = float(model.beta)
@@ -109,7 +109,7 @@ def test_truncated_rollouts_need_their_margin():
     model = model.replace(beta=jnp.asarray(0.9))
     whole = jitted(threat.threat)(factored.joint(model), factored.lifted(model, eta)).action
     short = factored.sub_threats(model.replace(horizon=2), eta[:2])
-    total = factored.summed(model, short)
+    total = factored.summed(short)
     assert (whole[0] > total[0] + 1e-3).any()
     rest = float(sum(0.9**k for k in range(2)))  # the most that the last two steps can cost
     margin = float(factored.truncation(0.9, 2, rest))
