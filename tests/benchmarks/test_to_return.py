@@ -45,7 +45,8 @@ def test_the_first_budget_with_which_all_seeds_pass_is_named(tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--env", "point_gather"), "env is 'point_gather'; it must be one of 'circuit', 'jam'"),
+        (("--env", "point_gather"), "env is 'point_gather'; it must be one of 'jam', 'circuit'"),
+        (("--budgets",), "budgets is (); it must have at least one value"),
         (("--budgets", "10"), "budgets.steps is 10; it must be"),
         (("--out", "nowhere/it.json"), "out is nowhere/it.json; its folder must exist"),
         (("--seeds", "0"), "seeds is 0; it must be"),

@@ -303,6 +303,7 @@ def test_trajectories_of_three_methods(circuit_runs, tmp_path, monkeypatch):
 
 def test_all_methods_are_timed_in_one_process(circuit_runs, tmp_path, monkeypatch):
     monkeypatch.setattr(timing, "SEARCHES", {"circuit": (1, 4)})
+    monkeypatch.setitem(timing.LEARNED_ON, "circuit", "circle")
     monkeypatch.setattr(timing, "ROUNDS", 1)
     monkeypatch.setattr(timing, "TIMED", {"circuit": {"RP": "circuit_lost"}})
     monkeypatch.setattr(timing.mpc, "action_seconds", lambda key, search: (search.horizon, 0.0))
