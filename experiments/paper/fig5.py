@@ -108,13 +108,14 @@ def rise(env: str, of: dict[str, Any]) -> list[dict[str, Any]]:
         last = float(np.mean([late[seed] for seed in both]))
         changes = np.asarray([late[seed] - before[seed] for seed in both])
         change, width = statistics.mean_interval(changes)
+        spread = "" if len(both) == 1 else f" +- {width:.2f}"
         lines.append(
             {
                 "task": env,
                 "method": method,
                 "steps": f"{steps[-1]:,}",
                 "last tenth": f"{last:.2f}",
-                "change from the tenth before": f"{change:+.2f} +- {width:.2f}",
+                "change from the tenth before": f"{change:+.2f}{spread}",
                 "of the return, %": f"{100 * change / abs(last):+.1f}",
             }
         )

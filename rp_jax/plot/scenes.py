@@ -175,7 +175,7 @@ def animate(
                 crosses[i][j].set_text("" if allowed[i, j] else "x")
         row, column = divmod(int(episode.action[t]), shape[1])
         frame.set_xy((shape[1] - 1 - column - 0.5, row - 0.5))
-        state = "" if episode.secure[t] else "; none is below: the least"
+        state = "" if episode.secure[t] else "\nnone is below: the least is taken"
         table.set_title(f"crossed: threat above {x:g}{state}", fontsize=10)
         world.set_title(f"step {t}" + (", CRASH" if episode.hit[t] else ""))
         if on_progress:

@@ -154,6 +154,8 @@ def test_whether_returns_still_rise_is_said_of_the_last_tenth_of_the_steps():
     before = (17 * 17 + 18 * 18) / 35
     assert line["change from the tenth before"] == f"{late - before:+.2f} +- 0.00"
     assert line["steps"] == "2,000"
+    (line,) = fig5.rise("jam", {"history": [row for row in history if row["seed"] == 0]})
+    assert line["change from the tenth before"] == f"{late - before:+.2f}"  # one seed: no interval
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.02, 0.5, 1.0])
