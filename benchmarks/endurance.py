@@ -51,12 +51,10 @@ def train(config: Config) -> Iterator[dict[str, float]]:
 
     Raises:
         FloatingPointError: something is no longer a finite number.
-        ValueError: there are fewer steps than environments.
     """
     task, settings = setups.quick_tasks()[config.env]
-    learning = dataclasses.replace(settings.planning, steps=config.steps)
-    learning.validate("planning")
     pmdp = setups.pmdp_of(task, settings)
+    learning = dataclasses.replace(settings.planning, steps=config.steps)
     traces = 0
 
     def counted(state: loop.LoopState, pmdp: PMDP) -> tuple[loop.LoopState, loop.Metrics]:
@@ -103,9 +101,10 @@ def main() -> None:
     """Exits with 1 if an inadmissible action was taken or something was compiled again."""
     config = tyro.cli(Config, prog="python -m benchmarks.endurance", description=__doc__)
     with cli.bad_input():
-        one_of("env", config.env, setups.quick_tasks())
+        offered = setups.quick_tasks()
+        _, settings = offered[one_of("env", config.env, offered)]
         number("minutes", config.minutes, above=0)
-        number("steps", config.steps, least=1, integer=True)
+        number("steps", config.steps, least=settings.planning.num_envs, integer=True)
     rows: list[dict[str, float]] = []
 
     def report() -> dict[str, Any]:

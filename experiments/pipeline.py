@@ -32,7 +32,7 @@ class Finished(NamedTuple):
 
 
 def default_out(task: str, preset: str) -> Path:
-    """results/TASK-PRESET-TIME, the time in microseconds."""
+    """results/TASK-PRESET-TIME, the time to the microsecond."""
     now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S-%f")
     return Path("results") / f"{task}-{preset}-{now}"
 

@@ -36,12 +36,12 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
         free = pmdp.replace(params=told, threats=None, x=jnp.asarray(jnp.inf))
         dqn = runs.agents(agents, free, planning, len(members))
         network = loop.make_network(planning, pmdp)
-        greedy = functools.partial(evaluate.action_values, network)
+        values = functools.partial(evaluate.action_values, network)
         tree = mpc.make_search(circuit, pmdp.params, STEPS_AHEAD, loaded.config.penalty)
         cases = {
-            "RP": (pmdp, greedy, jax.tree.map(lambda a: a[0], loaded.params)),
+            "RP": (pmdp, values, jax.tree.map(lambda a: a[0], loaded.params)),
             f"MPC, {STEPS_AHEAD} steps": (mpc.omniscient(tree), mpc.values, tree),
-            "DQN, no penalty": (free, greedy, jax.tree.map(lambda a: a[first], dqn)),
+            "DQN, no penalty": (free, values, jax.tree.map(lambda a: a[first], dqn)),
         }
         for method, case in cases.items():
             found.append({"track": track, "method": method, "episodes": _played(*case)})

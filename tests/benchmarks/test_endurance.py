@@ -70,3 +70,11 @@ def test_growth_is_the_slope_of_the_second_half():
     assert found["megabytes_per_hour"] == pytest.approx(6.0)
     assert found["hours_of_second_half"] == pytest.approx(50 / 60)
     assert endurance.summary(rows[:2])["megabytes_per_hour"] is None
+
+
+def test_fewer_steps_than_environments_are_refused(corridor, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["endurance", "--steps", "7"])
+    with pytest.raises(SystemExit) as stop:
+        endurance.main()
+    assert stop.value.code == 2
+    assert "steps is 7; it must be" in capsys.readouterr().out
