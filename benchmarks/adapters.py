@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.measure import Row, row_of
 from benchmarks.report import main
 from rp_jax.adapters import registry
-from rp_jax.envs import base
+from rp_jax.envs import autoreset, optional
 
 STEPS, REPEATS = 10, 40
 
@@ -24,7 +24,7 @@ def raw(name: str, batch: int) -> Callable[[np.ndarray], None]:
     def advance(key, states, actions, params):
         key, now = jax.random.split(key)
         keys = jax.random.split(now, batch)
-        return key, base.step_and_renew(env, keys, states, actions, params, look)
+        return key, autoreset.step_and_renew(env, keys, states, actions, params, look)
 
     keys = jax.random.split(jax.random.key(0), batch)
     carry = [jax.random.key(1), jax.vmap(env.reset, (0, None))(keys, params)]
@@ -65,7 +65,9 @@ def run(batch: int = 1024) -> list[Row]:
     rows = []
     for name in ("circuit", "jam"):
         env, params = registry.make(name)
-        draws = jax.random.randint(jax.random.key(0), (STEPS, batch), 0, env.num_actions(params))
+        draws = jax.random.randint(
+            jax.random.key(0), (STEPS, batch), 0, optional.num_actions(env, params)
+        )
         actions = list(np.asarray(draws))
         rates = alternated([raw(name, batch), adapted(name, batch)], actions)
         shares = [after / before for before, after in zip(*rates, strict=True)]

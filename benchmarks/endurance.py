@@ -17,8 +17,8 @@ import numpy as np
 import tyro
 
 from benchmarks import setups
-from experiments import cli, console
 from rp_jax import storage
+from rp_jax.cli import errors, terminal
 from rp_jax.planning import loop
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import number, one_of
@@ -52,8 +52,8 @@ def train(config: Config) -> Iterator[dict[str, float]]:
     Raises:
         FloatingPointError: something is no longer a finite number.
     """
-    task, settings = setups.quick_tasks()[config.env]
-    pmdp = setups.pmdp_of(task, settings)
+    world, settings = setups.quick_tasks()[config.env]
+    pmdp = setups.pmdp_of(world, settings)
     learning = dataclasses.replace(settings.planning, steps=config.steps)
     traces = 0
 
@@ -100,7 +100,7 @@ def summary(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
 def main() -> None:
     """Exits with 1 if an inadmissible action was taken or something was compiled again."""
     config = tyro.cli(Config, prog="python -m benchmarks.endurance", description=__doc__)
-    with cli.bad_input():
+    with errors.bad_input():
         offered = setups.quick_tasks()
         _, settings = offered[one_of("env", config.env, offered)]
         number("minutes", config.minutes, above=0)
@@ -110,7 +110,7 @@ def main() -> None:
     def report() -> dict[str, Any]:
         found = summary(rows)
         known = {name: value for name, value in found.items() if value is not None}
-        console.say("  ".join(f"{name} {value:,.6g}" for name, value in known.items()))
+        terminal.say("  ".join(f"{name} {value:,.6g}" for name, value in known.items()))
         if config.out is not None:
             storage.write_json(config.out, found)
         return found

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from benchmarks.bound import Piece
 from benchmarks.measure import Row, measure
 from benchmarks.report import main
-from rp_jax.envs import base, circuit, jam, point_gather
+from rp_jax.envs import autoreset, circuit, jam, optional, point_gather
 
 STEPS = 100
 BATCH = 1024
@@ -26,9 +26,9 @@ def steps(env, observed: bool, turns: int = STEPS):
             states, total = carry
             batch = total.shape[0]
             pick, move = jax.random.split(key)
-            action = jax.random.randint(pick, (batch,), 0, env.num_actions(params))
+            action = jax.random.randint(pick, (batch,), 0, optional.num_actions(env, params))
             keys = jax.random.split(move, batch)
-            states, _, outcome = base.auto_reset_step(env, keys, states, action, params)
+            states, _, outcome = autoreset.auto_reset_step(env, keys, states, action, params)
             total = total + outcome.reward
             if observed:
                 total = total + jax.vmap(env.observe, (0, None))(states, params).sum(axis=-1)

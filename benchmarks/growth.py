@@ -12,8 +12,8 @@ from benchmarks import env_step, seeds, train_step
 from benchmarks.measure import Row
 from benchmarks.report import machine
 from benchmarks.setups import pmdp_of, quick_tasks
-from experiments import console
 from rp_jax import storage
+from rp_jax.cli import terminal
 from rp_jax.envs import jam
 
 ENVS = tuple(4**k for k in range(8))  # 1 .. 16,384
@@ -96,8 +96,8 @@ def side_by_side(sizes: Sequence[int] = SEEDS) -> Series:
 
 def replay(sizes: Sequence[int] = REPLAYS) -> Series:
     """A step of all environments, learning included."""
-    task, config = quick_tasks()["jam"]
-    pmdp, rows = pmdp_of(task, config), []
+    world, config = quick_tasks()["jam"]
+    pmdp, rows = pmdp_of(world, config), []
     for size in sizes:
         planning = dataclasses.replace(config.planning, replay=size)
         rows.append(train_step.row("jam", pmdp, planning))
@@ -113,7 +113,7 @@ def main() -> None:
 
     found = [asdict(grow()) for grow in (envs, obstacles, side_by_side, replay)]
     lines = [{name: one[name] for name in ("title", "size", "vertical", "slope")} for one in found]
-    console.table("growth", lines, list(lines[0]))
+    terminal.table("growth", lines, list(lines[0]))
     out.mkdir(parents=True, exist_ok=True)
     storage.write_json(out / "growth.json", {"machine": machine(), "series": found})
     growth(found, out / "growth.png")

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from benchmarks.bound import Piece
 from benchmarks.measure import Row, measure, recount
 from benchmarks.report import main
+from rp_jax.dynamics import num_threats
 from rp_jax.envs import circuit, jam
 from rp_jax.hazards import SubRMDP
 from rp_jax.recon import labels, sampling
@@ -40,8 +41,8 @@ def row(name: str, sub: SubRMDP, estimator: labels.Estimator, batch: int) -> Row
     """Labelled states per second, all actions of each."""
     key = jax.random.key(0)
 
-    def program(key, agent, hazard, sub):
-        return labels.label_rows(key, agent, hazard, sub, estimator, ROWS)
+    def program(key, body, hazard, sub):
+        return labels.label_rows(key, body, hazard, sub, estimator, ROWS)
 
     def made(count: int) -> tuple[Any, ...]:
         features = sampling.uniform(key, sub, count)
@@ -58,8 +59,8 @@ def paths_needed(sub: SubRMDP, estimator: labels.Estimator, error: float, states
     Over states spread over the window and all actions; it falls with the root of the paths.
     """
     key = jax.random.key(1)
-    agent, hazard = sampling.states(sub, sampling.uniform(key, sub, states))
-    found = labels.label(key, agent, hazard, sub, estimator)
+    body, hazard = sampling.states(sub, sampling.uniform(key, sub, states))
+    found = labels.label(key, body, hazard, sub, estimator)
     return PATHS * float(jnp.mean(jnp.square(found.stderr))) / error**2
 
 
@@ -75,7 +76,7 @@ def run(batch: int = BATCH, batches: Sequence[int] = BATCHES, states: int = 4096
         rows.append(first)
         each = 1.0
         if estimator is not labels.exact_threat:
-            simulated = PATHS * sub.agent.num_threats * sub.source.horizon
+            simulated = PATHS * num_threats(sub.body) * sub.source.horizon
             rows.append(recount(first, "simulated steps", simulated))
             each = PATHS / paths_needed(sub, estimator, ERROR, states)
         rows.append(recount(first, f"states at {ERROR:g}", each))

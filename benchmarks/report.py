@@ -14,8 +14,8 @@ import rp_jax
 from benchmarks.bound import Bound, limits
 from benchmarks.compare import Key, earlier, key_of
 from benchmarks.measure import Row, in_processes
-from experiments import console
 from rp_jax import storage
+from rp_jax.cli import terminal
 from rp_jax.validate import number
 
 OUT = Path("results/benchmarks")
@@ -77,7 +77,7 @@ def _limits(row: Row, bound: Bound, same: bool) -> dict[str, str]:
 def _print(name: str, rows: Sequence[Row], before: Mapping[Key, float]) -> None:
     same = len({row.unit for row in rows}) == 1
     speeds = [_speed(row, same, before) for row in rows]
-    console.table(name, speeds, list(speeds[0]))
+    terminal.table(name, speeds, list(speeds[0]))
     bounds = [_limits(row, row.bound, same) for row in rows if row.bound]
     if bounds:
         best = limits()
@@ -85,7 +85,7 @@ def _print(name: str, rows: Sequence[Row], before: Mapping[Key, float]) -> None:
             f"{name}, of one unit; limits: {short(best.operations)} operations/s in a matrix "
             f"product, {short(best.bytes)} bytes/s in a copy"
         )
-        console.table(title, bounds, list(bounds[0]))
+        terminal.table(title, bounds, list(bounds[0]))
 
 
 def report(

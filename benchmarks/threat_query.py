@@ -6,7 +6,7 @@ from benchmarks.bound import Piece
 from benchmarks.measure import Row, measure, recount
 from benchmarks.report import main
 from benchmarks.setups import inside, more_chunks, pmdp_of, quick_tasks
-from rp_jax import evaluate
+from rp_jax import recording
 
 
 def run(batches: tuple[int, ...] = (1, 16, 256, 4096, 16_384)) -> list[Row]:
@@ -15,10 +15,10 @@ def run(batches: tuple[int, ...] = (1, 16, 256, 4096, 16_384)) -> list[Row]:
     "pairs" are those of a state and a hazard in its reach; only they are shown to a network.
     """
     rows = []
-    for name, (task, config) in quick_tasks().items():
-        pmdp = pmdp_of(task, config)
+    for name, (world, config) in quick_tasks().items():
+        pmdp = pmdp_of(world, config)
         for batch in batches:
-            states = jax.jit(evaluate.visited_states, static_argnums=2)(
+            states = jax.jit(recording.visited_states, static_argnums=2)(
                 jax.random.key(0), pmdp, batch
             )
             program = lambda pmdp, states: pmdp.threat(states)  # noqa: E731

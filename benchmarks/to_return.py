@@ -14,16 +14,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import tyro
 
 from benchmarks.report import machine
-from experiments import cli, console, pipeline, reconnaissance, tables, tasks
 from experiments.paper import published
 from experiments.paper.scores import RP
 from experiments.paper.section import HALF_A_DIGIT
-from experiments.runs import EXPERIMENTS
+from experiments.tasks import EXPERIMENTS
 from rp_jax import storage
+from rp_jax.cli import errors, experiment, terminal
+from rp_jax.cli.experiment import Run
+from rp_jax.runs import tables, train
+from rp_jax.runs.evaluate import evaluate
+from rp_jax.runs.plan import plan
+from rp_jax.runs.progress import OnProgress
+from rp_jax.runs.train import Process
+from rp_jax.threat.function import ThreatFunction
 from rp_jax.validate import number, one_of
 
 
@@ -42,11 +50,11 @@ class Config:
     out: Path | None = None  # JSON file
 
 
-def prepare(config: Config) -> tuple[Any, tasks.Task]:
-    """The task's own settings, and the task with the variant that is learned on.
+def prepared(config: Config) -> Run:
+    """Returns what is learned, checked: the task with the variant that is learned on alone.
 
     Raises:
-        ValueError: a setting is out of range.
+        ValueError: a setting is out of range, or a file cannot be used.
     """
     module = EXPERIMENTS[one_of("env", config.env, published.SCORES)]
     number("seeds", config.seeds, least=1, integer=True)
@@ -55,41 +63,72 @@ def prepare(config: Config) -> tuple[Any, tasks.Task]:
         quick,
         planning=dataclasses.replace(quick.planning, num_envs=config.num_envs, batch=config.batch),
         baseline=config.baseline,
-        threat=config.threat,
         episodes=config.episodes,
-        figures=False,
     )
     if not config.budgets:
         raise ValueError("budgets is (); it must have at least one value")
     for budget in config.budgets:
         dataclasses.replace(settings.planning, steps=budget).validate("budgets")
-    task = pipeline.checked(module.make_task, settings)
-    variant = published.LEARNED_ON[config.env]
-    return settings, task._replace(tests={variant: task.tests[variant]})
+    variant, world = published.LEARNED_ON[config.env], module.make_world(settings)
+    world = world._replace(tests={variant: world.tests[variant]})
+    threats = experiment.threats_of(settings)
+    process = Process(threat=config.threat, figures=False)
+    train.checked(world, settings, threats, process)
+    return Run(world, settings, threats, process, Path())
 
 
-def run(config: Config, settings: Any, task: tasks.Task) -> dict[str, Any]:
-    """A row per budget and seed; seconds of the threat function."""
+def learned(
+    run: Run, threat: ThreatFunction | None, budget: int, seed: int, bar: OnProgress
+) -> dict[str, Any]:
+    """Learns with a budget of steps, and evaluates: a row, with the seconds of learning."""
+    key, world, config = jax.random.key(0), run.world, run.config
+    (variant,) = world.tests
+    agents = plan(
+        key,
+        world.env,
+        world.params(),
+        threat,
+        x=config.x,
+        seeds=[seed],
+        config=dataclasses.replace(config.planning, steps=budget),
+        on_progress=bar,
+    )
+    (row,) = evaluate(
+        key,
+        agents,
+        params=world.params(variant),
+        episodes=config.episodes,
+        penalty=config.penalty,
+        name=variant,
+        on_progress=bar,
+    )
+    took = {
+        "seconds": agents.seconds["planning"],
+        "compile_seconds": agents.seconds["planning_compilation"],
+    }
+    return {"budget": budget, **took, **row}
+
+
+def measured(config: Config, run: Run) -> dict[str, Any]:
+    """Returns a row per budget and seed, and the seconds of the threat function."""
+    key = jax.random.key(0)
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
-        models, _, _ = reconnaissance.learn_threats(task, settings, Path(folder))
+        with terminal.progress() as bar:
+            threat = train.threat_of(
+                key, run.world, run.config, run.threats, Path(folder), run.process, bar
+            )
         explored = time.perf_counter() - began if config.threat is None else None
         rows = []
         for budget in config.budgets:
             for seed in range(config.seeds):
-                planning = dataclasses.replace(settings.planning, steps=budget)
-                own = dataclasses.replace(settings, planning=planning, seed=seed)
-                pmdp = tasks.make_pmdp(task, own, models, task.train)
-                place = Path(folder) / f"{budget}-{seed}"
-                members = tasks.members_of(own)
-                trained, (row,) = pipeline.plan_and_evaluate(task, own, pmdp, members, place)
-                took = {"seconds": trained.seconds, "compile_seconds": trained.compile_seconds}
-                rows.append({"budget": budget, **took, **row})
+                with terminal.progress(f"{budget:,} steps, seed {seed}") as bar:
+                    rows.append(learned(run, threat, budget, seed, bar))
     return {"machine": machine(), "threat_seconds": explored, "rows": rows}
 
 
 def show(found: dict[str, Any], env: str) -> None:
-    """A line per budget, and the first of them that all seeds pass with."""
+    """Prints a line per budget, and the first of them that all seeds pass with."""
     (wanted, rate), lines, passed = published.SCORES[env][published.LEARNED_ON[env]][RP], [], []
     most = rate + HALF_A_DIGIT  # it was rounded
     for budget in dict.fromkeys(row["budget"] for row in found["rows"]):
@@ -110,19 +149,19 @@ def show(found: dict[str, Any], env: str) -> None:
             }
         )
     title = f"{env}: past {wanted:g}, and less than {100 * most:g} % crashes"
-    console.table(title, lines, list(lines[0]))
-    console.say(f"all seeds past it: {passed[0] if passed else 'with none of these budgets'}")
+    terminal.table(title, lines, list(lines[0]))
+    terminal.say(f"all seeds past it: {passed[0] if passed else 'with none of these budgets'}")
     if found["threat_seconds"] is not None:
-        console.say(f"threat function: {found['threat_seconds']:.1f} s, compilation included")
+        terminal.say(f"threat function: {found['threat_seconds']:.1f} s, compilation included")
 
 
 def main() -> None:
-    """Exits with 2 on bad input."""
+    """Runs the command; exits with 2 on bad input."""
     config = tyro.cli(Config, prog="python -m benchmarks.to_return", description=__doc__)
-    with cli.bad_input():
-        settings, task = prepare(config)
-        cli.needs_folder(config.out)
-    found = run(config, settings, task)
+    with errors.bad_input():
+        run = prepared(config)
+        errors.needs_folder(config.out)
+    found = measured(config, run)
     show(found, config.env)
     if config.out is not None:
         storage.write_json(config.out, found)

@@ -21,9 +21,7 @@ def row(title: str, pmdp: PMDP, planning: LoopConfig) -> Row:
         return loop.chunk(state, pmdp, planning, iterations)
 
     one = Piece(lambda state, pmdp: program(state, pmdp, 1), (state, pmdp), ITERATIONS)
-    pieces = [one]
-    if pmdp.threats is not None:
-        pieces += more_chunks(pmdp, state.states, ITERATIONS)
+    pieces = [one, *more_chunks(pmdp, state.states, ITERATIONS)]
     batch = planning.num_envs
     made = (program, state, pmdp)
     return measure(title, "steps", batch, ITERATIONS * batch, *made, carried=True, pieces=pieces)
@@ -32,9 +30,9 @@ def row(title: str, pmdp: PMDP, planning: LoopConfig) -> Row:
 def run() -> list[Row]:
     """Acting, environment, observation, threat, replay and learning, tuned recipe."""
     rows = []
-    for name, (task, config) in quick_tasks().items():
+    for name, (world, config) in quick_tasks().items():
         samples = config.planning.samples_per_step
-        found = row(f"{name}, {samples:g} samples a step", pmdp_of(task, config), config.planning)
+        found = row(f"{name}, {samples:g} samples a step", pmdp_of(world, config), config.planning)
         rows += [found, recount(found, "samples", samples)]
     return rows
 

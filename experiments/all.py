@@ -23,7 +23,7 @@ from typing import Any
 import jax
 import tyro
 
-from experiments import cli, console, pipeline, report, settings
+from experiments import report
 from experiments.paper import (
     ablations,
     brief,
@@ -51,6 +51,9 @@ from experiments.paper.scores import read
 from experiments.paper.section import CLOSE, Section
 from experiments.paper.sources import LOG, RunError, Sources
 from rp_jax import storage
+from rp_jax.cli import errors, terminal
+from rp_jax.cli.experiment import default_out
+from rp_jax.runs import record
 from rp_jax.validate import one_of
 
 MODULES: tuple[ModuleType, ...] = (
@@ -59,7 +62,7 @@ MODULES: tuple[ModuleType, ...] = (
     walls,
 )
 RESULTS: dict[str, Any] = {module.__name__.rpartition(".")[2]: module for module in MODULES}
-NAME = "experiments.all"
+NAME = "python -m experiments.all"
 
 
 @dataclass(frozen=True)
@@ -80,16 +83,16 @@ def begun(config: Config) -> tuple[str, Path]:
     """
     for name in config.only:
         one_of("only", name, [*RESULTS, *COMMANDS])
-    cli.needs_matplotlib()
+    errors.needs_matplotlib()
     if config.resume is None:
         preset = one_of("preset", config.preset or "quick", SIZES)
-        folder = storage.new_folder(config.out or pipeline.default_out("paper", preset))
-        plain = {"experiment": NAME, "preset": preset, **settings.machine(NAME)}
+        folder = storage.new_folder(config.out or default_out(f"paper-{preset}"))
+        plain = {"experiment": NAME, "preset": preset, **record.machine(None)}
         storage.write_json(folder / "config.json", plain)
         return preset, folder
     if config.preset or config.out:
         raise ValueError(f"resume is {config.resume}; only --only may be given with it")
-    found = settings.read(config.resume)
+    found = record.read_json(config.resume / "config.json")
     if found.get("experiment") != NAME:
         raise ValueError(f"resume is {config.resume}; it must be a folder of {NAME}")
     return one_of("preset", str(found.get("preset")), SIZES), config.resume
@@ -99,7 +102,7 @@ def make(names: Sequence[str], sources: Sources, folder: Path) -> dict[str, str]
     """Makes results and runs, one after another; returns what failed, and why."""
     failed = {}
     for name in names:
-        console.say(f"== {name}", style="bold")
+        terminal.say(f"== {name}", style="bold")
         try:
             if name in RESULTS:
                 result(RESULTS[name], sources, folder / name)
@@ -157,7 +160,7 @@ def blocks(folder: Path, preset: str, failed: dict[str, str]) -> list[report.Blo
     claims = [claim for section in told.values() for claim in section.claims]
     counts = Counter(claim.verdict.partition(" (")[0] for claim in claims)
     missing = [name for name in RESULTS if name not in told and name not in failed]
-    machine = settings.machine(NAME)
+    machine = record.machine(None)
     versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
     out: list[report.Block] = [
         report.Heading("The paper's figures and tables, and more", 1),
@@ -209,20 +212,20 @@ def ledger(folder: Path) -> list[dict[str, Any]]:
 
 def main(argv: Sequence[str] | None = None) -> Path:
     """Exits with 1 if a result failed, with 2 on bad input, with 130 on Ctrl-C."""
-    config = tyro.cli(Config, prog=f"python -m {NAME}", description=__doc__, args=argv)
-    with cli.bad_input():
+    config = tyro.cli(Config, prog=NAME, description=__doc__, args=argv)
+    with errors.bad_input():
         preset, folder = begun(config)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # ends the running process too
     sources = Sources(folder / "runs", preset)
     try:
         failed = make(config.only or tuple(RESULTS), sources, folder)
     except KeyboardInterrupt:
-        console.say(f"to go on: python -m {NAME} --resume {folder}", style="yellow")
+        terminal.say(f"to go on: {NAME} --resume {folder}", style="yellow")
         raise SystemExit(130) from None
     report.write(folder, blocks(folder, preset, failed))
-    console.say(f"results: {folder / 'report.html'}")
+    terminal.say(f"results: {folder / 'report.html'}")
     for name, why in failed.items():
-        console.say(f"failed: {name}: {why}", style="red")
+        terminal.say(f"failed: {name}: {why}", style="red")
     if failed:
         raise SystemExit(1)
     return folder

@@ -11,42 +11,36 @@ python -m experiments.compare --env jam --methods CPO --cpo.rollout.num-envs 64
 """
 
 import dataclasses
+import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import tyro
+import jax
 
-from experiments import (
-    cli,
-    console,
-    evaluation,
-    mpc,
-    pipeline,
-    policy_gradient,
-    reconnaissance,
-    tables,
-    tasks,
-    training,
-)
-from experiments.runs import EXPERIMENTS
-from experiments.settings import begin
+from experiments.paper.published import AVOIDED, FIRST_PENALTY, SETTINGS
+from experiments.resumable import Command, main
+from experiments.tasks import EXPERIMENTS
 from rp_jax import storage
 from rp_jax.baselines.cpo import CPOConfig
+from rp_jax.baselines.mpc import make_search
 from rp_jax.baselines.pid_lagrangian import PIDConfig
-from rp_jax.checkpoints import Checkpoints
+from rp_jax.cli import experiment, terminal
+from rp_jax.cli.experiment import Run
+from rp_jax.runs import policy_gradient, tables, train
+from rp_jax.runs.agents import Agents
+from rp_jax.runs.plan import plan
+from rp_jax.runs.policy_gradient import Policies
+from rp_jax.runs.progress import OnProgress
+from rp_jax.runs.train import Process, TrainConfig
+from rp_jax.runs.tree_search import evaluate_search
+from rp_jax.threat.function import ThreatFunction
 from rp_jax.validate import number, one_of
 
-# Penalties of DQN, c, and steps that MPC looks ahead; section 5 and appendix G.
-SETTINGS: dict[str, tuple[tuple[float, ...], float, int]] = {
-    "circuit": ((0.0, 20.0, 200.0), 1e-3, 4),
-    "jam": ((5.0, 50.0, 500.0), 1e-2, 3),
-    "point_gather": ((1.0, 10.0, 50.0), 0.1, 2),
-}
-FIRST_PENALTY = {"jam": 5.0}  # from which that of DQN rises, appendix G.2
 METHODS = ("RP", "DQN", "CPO", "PID", "MPC")
+Rows = list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -66,8 +60,8 @@ class Config:
     out: Path | None = None  # folder for results; default: results/compare-ENV-TIME
 
 
-def settings_of(config: Config) -> Any:
-    """The task's own settings, with the comparison's sizes.
+def settings_of(config: Config) -> TrainConfig:
+    """Returns the task's own settings, with the comparison's sizes.
 
     Raises:
         ValueError: a setting is out of range.
@@ -87,112 +81,189 @@ def settings_of(config: Config) -> Any:
         seeds=config.seeds,
         seed=config.seed,
         episodes=config.episodes,
-        threat=config.threat,
-        figures=False,
         planning=dataclasses.replace(quick.planning, steps=config.steps),
     )
     settings.validate()
     return settings
 
 
+def prepared(config: Config) -> Run:
+    """Returns the comparison, checked, but for its folder.
+
+    Raises:
+        ValueError: a setting is out of range, or a file cannot be used.
+    """
+    settings = settings_of(config)
+    world = EXPERIMENTS[config.env].make_world(settings)
+    process = Process(out=config.out, threat=config.threat, figures=False)
+    threats = experiment.threats_of(settings)
+    train.checked(world, settings, threats, process)
+    return Run(world, settings, threats, process, Path())
+
+
+def by_reconnaissance(config: Config, run: Run, folder: Path, bar: OnProgress) -> Rows:
+    """Learns and evaluates RP."""
+    threat = train.threat_of(
+        jax.random.key(0), run.world, run.config, run.threats, run.folder, run.process, bar
+    )
+    return by_q_learning(run, folder, bar, threat, x=run.config.x)
+
+
+def by_penalties(config: Config, run: Run, folder: Path, bar: OnProgress) -> Rows:
+    """Learns and evaluates DQN without a shield, with each penalty."""
+    first = FIRST_PENALTY.get(config.env)
+    penalties, _, _ = SETTINGS[config.env]
+    rise = {"learning_penalty": penalties, "learning_penalty_from": first}
+    return by_q_learning(run, folder, bar, None, **rise)
+
+
 def by_q_learning(
-    task: tasks.Task,
-    config: Any,
-    models: dict | None,
-    members: Sequence[training.Member],
-    folder: Path,
-    checkpoints: Checkpoints,
-) -> list[dict[str, Any]]:
-    """Rows of RP or of penalised DQN; all members learn in one program."""
-    pmdp = tasks.make_pmdp(task, config, models, task.train)
-    trained, rows = pipeline.plan_and_evaluate(task, config, pmdp, members, folder, checkpoints)
-    return with_learning(rows, trained, members)
+    run: Run, folder: Path, bar: OnProgress, threat: ThreatFunction | None, **settings: Any
+) -> Rows:
+    """Learns all agents in one program, and evaluates them."""
+    key, config, world = jax.random.key(0), run.config, run.world
+    agents = plan(
+        key,
+        world.env,
+        world.params(),
+        threat,
+        seeds=numbers(config),
+        config=config.planning,
+        penalty=config.penalty,
+        folder=folder,
+        settings=world.settings,
+        on_progress=bar,
+        **settings,
+    )
+    tests = {name: world.params(name) for name in world.tests}
+    table = train.evaluated(key, world, tests, agents, config, folder, "one", bar)
+    return with_learning(table, agents)
+
+
+def numbers(config: TrainConfig) -> list[int]:
+    """Returns the numbers of the agents that learn side by side."""
+    return list(range(config.seed, config.seed + config.seeds))
+
+
+def by_cpo(config: Config, run: Run, folder: Path, bar: OnProgress) -> Rows:
+    """Learns and evaluates CPO, as released: from rewards less the penalty."""
+    return by_policy_gradient("CPO", config.cpo, run.config.penalty, config, run, folder, bar)
+
+
+def by_pid(config: Config, run: Run, folder: Path, bar: OnProgress) -> Rows:
+    """Learns and evaluates PID-Lagrangian PPO, which finds its penalty itself."""
+    return by_policy_gradient("PID-Lagrangian", config.pid, 0.0, config, run, folder, bar)
 
 
 def by_policy_gradient(
-    method: policy_gradient.Method,
-    task: tasks.Task,
-    config: Any,
+    method: str,
+    learner: CPOConfig | PIDConfig,
+    learning_penalty: float,
+    config: Config,
+    run: Run,
     folder: Path,
-    checkpoints: Checkpoints,
-) -> list[dict[str, Any]]:
-    """Rows of CPO or PID-Lagrangian PPO."""
-    pmdp = tasks.make_pmdp(task, config, None, task.train)
-    agents = policy_gradient.learn(method, pmdp, config, folder, checkpoints.at("planning"))
-    rows = evaluation.evaluate_all(task, config, pmdp, agents, checkpoints.at("evaluation"))
-    return with_learning(rows, agents.trained, agents.members)
+    bar: OnProgress,
+) -> Rows:
+    """Learns all policies in one program, and evaluates them."""
+    key, settings, world = jax.random.key(0), run.config, run.world
+    policies = policy_gradient.learn_policies(
+        key,
+        world.env,
+        world.params(),
+        method,
+        c=SETTINGS[config.env][1],
+        seeds=numbers(settings),
+        config=learner,
+        steps=config.steps,
+        learning_penalty=learning_penalty,
+        penalty=settings.penalty,
+        folder=folder,
+        on_progress=bar,
+    )
+    rows: Rows = []
+    for name in world.tests:
+        params = world.params(name)
+        table = policy_gradient.evaluate_policies(
+            key,
+            policies,
+            params,
+            episodes=settings.episodes,
+            penalty=settings.penalty,
+            name=name,
+            folder=folder,
+            on_progress=bar,
+        )
+        times = {
+            "seconds_per_100_actions": policy_gradient.time_policies(key, policies, params).wall,
+            "train_seconds": policies.seconds["planning"],
+        }
+        rows += [{**row, **times} for row in table]
+    return with_learning(rows, policies)
 
 
-def with_learning(
-    rows: Sequence[Mapping[str, Any]],
-    trained: training.Trained,
-    members: Sequence[training.Member],
-) -> list[dict[str, Any]]:
-    """Rows of evaluation with what their learners met while learning, and how many they were."""
+def with_learning(rows: Sequence[Mapping[str, Any]], learned: Agents | Policies) -> Rows:
+    """Returns rows of evaluation with what was met while learning, and how many learned."""
     found = []
     for row in rows:
         who = (row["method"], row["seed"])
-        mine = [h for h in trained.history if (h["method"], h["seed"]) == who]
+        mine = [h for h in learned.history if (h["method"], h["seed"]) == who]
         met = {
             "training_steps": mine[-1]["steps"],
             "training_episodes": sum(h["episodes"] for h in mine),
             "training_crashes": sum(h["crashes"] for h in mine),
-            "side_by_side": len(members),
+            "side_by_side": len(learned),
         }
         found.append({**row, **met})
     return found
 
 
-def by_search(config: Config, horizon: int, checkpoints: Checkpoints) -> list[dict[str, Any]]:
-    """Rows of MPC."""
-    settings = mpc.Config(config.env, horizon, config.mpc_episodes, seed=config.seed)
-    rows = mpc.run(settings, *mpc.prepare(settings), checkpoints)
+def by_search(config: Config, run: Run, folder: Path, bar: OnProgress) -> Rows:
+    """Evaluates MPC."""
+    world, penalty = run.world, run.config.penalty
+    _, _, horizon = SETTINGS[config.env]
+    avoided = AVOIDED.get(config.env, penalty)
+    table = evaluate_search(
+        jax.random.key(config.seed),
+        {
+            name: make_search(world.env, world.params(name), horizon, avoided)
+            for name in world.tests
+        },
+        episodes=config.mpc_episodes,
+        penalty=penalty,
+        folder=folder,
+        on_progress=bar,
+    )
     counts = ("training_steps", "training_episodes", "training_crashes", "side_by_side")
-    return [{**row, **dict.fromkeys(counts, 0)} for row in rows]
+    return [{**row, "seed": config.seed, **dict.fromkeys(counts, 0)} for row in table]
 
 
-def run(
-    config: Config, settings: Any, task: tasks.Task, folder: Path, checkpoints: Checkpoints
-) -> list[dict[str, Any]]:
-    """Writes compare.json after each method, so that nothing is lost."""
-    penalties, limit, horizon = SETTINGS[config.env]
-    rows: list[dict[str, Any]] = []
+MAKERS: dict[str, Callable[[Config, Run, Path, OnProgress], Rows]] = {
+    "RP": by_reconnaissance,
+    "DQN": by_penalties,
+    "CPO": by_cpo,
+    "PID": by_pid,
+    "MPC": by_search,
+}
 
-    def add(more: Sequence[dict[str, Any]]) -> None:
-        rows.extend(more)
-        storage.write_json(folder / "compare.json", rows)
 
-    if "RP" in config.methods:
-        models, _, _ = reconnaissance.learn_threats(task, settings, folder, checkpoints)
-        members = tasks.members_of(settings)
-        at = checkpoints.at("rp")
-        add(by_q_learning(task, settings, models, members, folder / "rp", at))
-    if "DQN" in config.methods:
-        plain = dataclasses.replace(
-            settings, x=float("inf"), learning_penalty_from=FIRST_PENALTY.get(config.env)
-        )
-        each = tasks.members_of(plain)
-        members = [m._replace(learning_penalty=p) for p in penalties for m in each]
-        at = checkpoints.at("dqn")
-        add(by_q_learning(task, plain, None, members, folder / "dqn", at))
-    # As released, CPO learns from rewards less the penalty; PID-Lagrangian finds its own.
-    on_policy = {
-        "CPO": ("CPO", config.cpo, settings.penalty),
-        "PID": ("PID-Lagrangian", config.pid, 0.0),
-    }
-    for method, (name, learning, penalty) in on_policy.items():
+def compare(config: Config, run: Run) -> Rows:
+    """Makes the rows of each method that has none yet; writes compare.json after each."""
+    rows: Rows = []
+    for method in METHODS:
         if method in config.methods:
-            out, at = folder / method.lower(), checkpoints.at(method.lower())
-            learner = policy_gradient.Method(name, learning, limit)
-            own = dataclasses.replace(settings, learning_penalty=penalty)
-            add(by_policy_gradient(learner, task, own, out, at))
-    if "MPC" in config.methods:
-        add(by_search(config, horizon, checkpoints.at("mpc")))
+            folder = run.folder / method.lower()
+            table = folder / "table.json"
+            if not table.exists():
+                folder.mkdir(exist_ok=True)
+                with terminal.progress(method) as bar:
+                    storage.write_json(table, MAKERS[method](config, run, folder, bar))
+            rows += json.loads(table.read_text())
+            storage.write_json(run.folder / "compare.json", rows)
     return rows
 
 
-def show(rows: Sequence[dict[str, Any]]) -> None:
-    """One table per variant, a line per method and seed."""
+def show(rows: Rows) -> None:
+    """Prints one table per variant, a line per method and seed."""
     for variant in dict.fromkeys(row["variant"] for row in rows):
         lines = []
         for row in rows:
@@ -213,31 +284,22 @@ def show(rows: Sequence[dict[str, Any]]) -> None:
                     "ms an action": f"{10 * row['seconds_per_100_actions']:.2f}",
                 }
             )
-        console.table(f"{rows[0]['env']} {variant}", lines, list(lines[0]))
+        terminal.table(f"{rows[0]['env']} {variant}", lines, list(lines[0]))
 
 
-def main() -> None:
-    """Exits with 2 on bad input."""
-    name, argv = "experiments.compare", sys.argv[1:]
-    folder = cli.to_resume(argv)
-    with cli.bad_input():
-        if folder is not None:
-            config, checkpoints = cli.resumed(name, folder, Config, argv)
-            settings = settings_of(config)
-            task = pipeline.checked(EXPERIMENTS[config.env].make_task, settings)
-        else:
-            about = f"{__doc__}\n\n--resume DIR, alone, goes on with an interrupted run."
-            config = tyro.cli(Config, prog=f"python -m {name}", description=about)
-            settings = dataclasses.replace(
-                settings_of(config), out=config.out or pipeline.default_out("compare", config.env)
-            )
-            make_task = EXPERIMENTS[config.env].make_task
-            task, folder = pipeline.prepare(make_task, settings, "compare")
-            checkpoints = begin(folder, name, dataclasses.asdict(config))
-    with cli.resumable(name, folder, checkpoints):
-        show(run(config, settings, task, folder, checkpoints))
-        console.say(f"results: {folder}")
+def job(config: Config, run: Run, folder: Path) -> None:
+    """Compares into a folder, and shows the tables."""
+    show(compare(config, run._replace(folder=folder)))
 
+
+COMMAND = Command(
+    name="python -m experiments.compare",
+    about=f"{__doc__}\n\n--resume DIR, alone, goes on with an interrupted run.",
+    settings=Config,
+    prepare=prepared,
+    title=lambda config: f"compare-{config.env}",
+    job=job,
+)
 
 if __name__ == "__main__":
-    main()
+    main(COMMAND, sys.argv[1:])

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from experiments import cli, console, pipeline
 from rp_jax import storage
+from rp_jax.cli import errors, terminal
+from rp_jax.cli.experiment import default_out
 from rp_jax.tabular import frozen_lake, oracle, secure, threat, thresholds
 from rp_jax.tabular.cmdp import FiniteCMDP
 from rp_jax.validate import number
@@ -50,14 +51,14 @@ class Config:
 
 
 def solve_all(lakes: FiniteCMDP, c: jax.Array) -> dict[str, Any]:
-    """Every baseline and rule on every lake and bound.
+    """Solves every lake for every baseline, rule and bound.
 
     Args:
         lakes: (L, ...) CMDPs of one horizon.
         c: (C,) bounds.
 
     Returns:
-        by rule, arrays (L, B, C): the danger of greedy-eta, x, return, danger, and the worst
+        By rule, arrays (L, B, C): the danger of greedy-eta, x, return, danger, and the worst
         danger inside the sets.
     """
 
@@ -86,33 +87,33 @@ def solve_all(lakes: FiniteCMDP, c: jax.Array) -> dict[str, Any]:
 
 
 def run(config: Config) -> dict[str, Any]:
-    """The rows of the table, the curves, and what figure 2 shows."""
+    """Returns the rows of the table, the curves, and what figure 2 shows."""
     bounds = sorted({*config.c, *config.curve})
     rows, optima, programs = [], [], []
     total = len(config.horizons) * (1 + 2 * len(frozen_lake.HOLES))
-    with console.progress("frozen lake") as bar:
+    with terminal.progress() as bar:
         done = 0
         for horizon in config.horizons:
             lakes = [
                 frozen_lake.frozen_lake(holes=holes, horizon=horizon, slip=config.slip)
                 for holes in frozen_lake.HOLES
             ]
-            bar("", done, total, f"T = {horizon}: rules")
+            bar("frozen lake", done, total, f"T = {horizon}: rules")
             together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *lakes)
             solved = jax.device_get(jax.jit(solve_all)(together, jnp.asarray(bounds)))
             done += 1
             for i, (holes, lake) in enumerate(zip(frozen_lake.HOLES, lakes, strict=True)):
                 variant = f"T={horizon}, {holes} holes"
-                bar("", done, total, f"{variant}: all Lagrange multipliers")
+                bar("frozen lake", done, total, f"{variant}: all Lagrange multipliers")
                 vertices = oracle.frontier(lake, upto=max(bounds))
                 optima += lagrangian_rows(variant, vertices, bounds)
                 best = {c: oracle.mixed(vertices, c) for c in bounds}
                 rows += rule_rows(variant, bounds, best, solved, i)
-                bar("", done + 1, total, f"{variant}: linear program")
+                bar("frozen lake", done + 1, total, f"{variant}: linear program")
                 if config.program:
                     programs.append(check(variant, lake, config.c[0], best[config.c[0]]))
                 done += 2
-        bar("", total, total)
+        bar("frozen lake", total, total, "")
     return {"rows": rows, "optima": optima, "programs": programs, "map": threat_map(config)}
 
 
@@ -123,7 +124,7 @@ def rule_rows(
     solved: Mapping[str, Mapping[str, np.ndarray]],
     lake: int,
 ) -> list[dict[str, Any]]:
-    """A row per rule, baseline and bound; null where the baseline policy is not safe."""
+    """Returns a row per rule, baseline and bound; null where the baseline policy is not safe."""
     rows = []
     for rule in thresholds.RULES:
         found = solved[rule]
@@ -143,7 +144,7 @@ def rule_rows(
 def lagrangian_rows(
     variant: str, vertices: Sequence[oracle.Vertex], bounds: Sequence[float]
 ) -> list[dict[str, Any]]:
-    """The exact optimum at each bound, and the best policy of one Lagrange multiplier."""
+    """Returns the exact optimum at each bound, and the best policy of one Lagrange multiplier."""
     rows = []
     for c in bounds:
         single = oracle.unmixed(list(vertices), c)
@@ -161,7 +162,7 @@ def lagrangian_rows(
 
 
 def check(variant: str, lake: FiniteCMDP, c: float, best: float) -> dict[str, Any]:
-    """The linear program's optimum beside the Lagrangian curve's."""
+    """Compares the linear program's optimum with that of the Lagrangian curve."""
     began = time.perf_counter()
     value = oracle.optimum(lake, c).value
     seconds = time.perf_counter() - began
@@ -176,7 +177,7 @@ def check(variant: str, lake: FiniteCMDP, c: float, best: float) -> dict[str, An
 
 
 def threat_map(config: Config) -> dict[str, Any]:
-    """T_0 of eta* on the map, where falling ends the episode, so that threats are probabilities."""
+    """Returns T_0 of eta* on the map, where falling ends the episode: threats are probabilities."""
     horizon = config.horizons[0]
     lake = frozen_lake.frozen_lake(holes="paper", horizon=horizon, slip=config.slip)
     action = threat.least_threat(lake).action[0]
@@ -190,7 +191,7 @@ def threat_map(config: Config) -> dict[str, Any]:
 
 
 def show(results: Mapping[str, Any], config: Config) -> None:
-    """The table on the terminal, for the best baseline."""
+    """Prints the table for the best baseline."""
     for variant in dict.fromkeys(row["variant"] for row in results["rows"]):
         rows = [
             {name: _cell(name, row[name]) for name in COLUMNS}
@@ -198,10 +199,10 @@ def show(results: Mapping[str, Any], config: Config) -> None:
             if row["variant"] == variant and row["c"] in config.c and row["baseline"] == "eta*"
         ]
         rows.sort(key=lambda row: float(row["c"]))
-        console.table(f"{variant}, baseline eta*", rows, COLUMNS)
+        terminal.table(f"{variant}, baseline eta*", rows, COLUMNS)
     if results["programs"]:
         rows = [{**row, "difference": f"{row['difference']:.1e}"} for row in results["programs"]]
-        console.table("the optimum, twice", rows, list(rows[0]))
+        terminal.table("the optimum, twice", rows, list(rows[0]))
 
 
 def _cell(name: str, value: Any) -> str:
@@ -212,7 +213,7 @@ def _cell(name: str, value: Any) -> str:
 
 
 def plot_map(shown: Mapping[str, Any], path: Path) -> None:
-    """Figure 2, from what `threat_map` found."""
+    """Draws figure 2, from what `threat_map` found."""
     from rp_jax.plot import tabular
 
     title = f"action threat of eta*, T = {shown['horizon']}"
@@ -221,7 +222,7 @@ def plot_map(shown: Mapping[str, Any], path: Path) -> None:
 
 
 def plot_rules(results: Mapping[str, Any], folder: Path) -> None:
-    """Figures 3a and 3b, and the rules' shares of the optimum."""
+    """Draws figures 3a and 3b, and the rules' shares of the optimum."""
     from rp_jax.plot import tabular
 
     tabular.budgets(results["rows"], results["optima"], BASELINES, folder / "figure_3.png")
@@ -229,12 +230,12 @@ def plot_rules(results: Mapping[str, Any], folder: Path) -> None:
 
 
 def main() -> None:
-    """The command line."""
+    """Runs the command; exits with 2 on bad input."""
     config = tyro.cli(Config, description=__doc__)
-    with cli.bad_input():
+    with errors.bad_input():
         config.validate()
-        cli.needs_matplotlib(config.figures, cli.NO_FIGURES)
-        folder = storage.new_folder(config.out or pipeline.default_out("frozen_lake", "exact"))
+        errors.needs_matplotlib(config.figures, errors.NO_FIGURES)
+        folder = storage.new_folder(config.out or default_out("frozen_lake-exact"))
     with jax.enable_x64(True):
         results = run(config)
     settings = {name: str(v) if isinstance(v, Path) else v for name, v in asdict(config).items()}
@@ -246,7 +247,7 @@ def main() -> None:
     if config.figures:
         plot_map(results["map"], folder / "figure_2.png")
         plot_rules(results, folder)
-    console.say(f"results: {folder}")
+    terminal.say(f"results: {folder}")
 
 
 if __name__ == "__main__":

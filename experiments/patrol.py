@@ -5,14 +5,24 @@ Patrolling between two corners: no shield; no shield, but danger penalised; the 
 python -m experiments.patrol --threat results/RUN/threat
 """
 
-from experiments import ablation, jam, tasks
+import sys
+from typing import Any
+
+from experiments import jam
+from rp_jax.cli import experiment, shields
+from rp_jax.cli.experiment import Experiment
 from rp_jax.envs import patrol
+from rp_jax.runs.train import World
 
 
-def make_task(config: jam.Config) -> tasks.Task:
-    """That of Jam, with the other reward; threat functions do not know the difference."""
-    return jam.make_task(config)._replace(env=patrol, draw=None)
+def make_world(config: Any) -> World:
+    """Jam's, with the other reward; threat functions do not know the difference."""
+    return jam.make_world(config)._replace(name="patrol", env=patrol)
 
+
+EXPERIMENT = Experiment(
+    "python -m experiments.patrol", __doc__ or "", jam.PRESETS, make_world, job=shields.job
+)
 
 if __name__ == "__main__":
-    ablation.main("experiments.patrol", __doc__ or "", jam.PRESETS, make_task)
+    experiment.run(EXPERIMENT, sys.argv[1:])

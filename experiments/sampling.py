@@ -12,8 +12,8 @@ import jax
 import numpy as np
 import tyro
 
-from experiments import cli, console, recipes
-from rp_jax import storage
+from rp_jax import recipes, storage
+from rp_jax.cli import errors, terminal
 from rp_jax.envs import circuit, jam
 from rp_jax.hazards import SubRMDP
 from rp_jax.recon import labels, sampling
@@ -44,7 +44,7 @@ class Config:
 
 
 def test_sets(key: jax.Array, sub: SubRMDP, config: Config, x: float) -> dict[str, Any]:
-    """Fresh labelled states, the same for all: spread over the window, and where it matters."""
+    """Labels fresh states, the same for all: spread over the window, and where it matters."""
     keys = jax.random.split(key, 5)
     pool = sampling.uniform(keys[0], sub, 10 * config.test_states)
     rough = _label(keys[1], sub, pool, 256)
@@ -59,12 +59,12 @@ def test_sets(key: jax.Array, sub: SubRMDP, config: Config, x: float) -> dict[st
 
 def _label(key: jax.Array, sub: SubRMDP, features: jax.Array, paths: int) -> jax.Array:
     estimator = labels.best_estimator(sub, paths)
-    agent, hazard = sampling.states(sub, features)
-    return labels.label(key, agent, hazard, sub, estimator).threat
+    body, hazard = sampling.states(sub, features)
+    return labels.label(key, body, hazard, sub, estimator).threat
 
 
 def run(config: Config) -> list[dict[str, Any]]:
-    """One row per hazard, size, sampling, repeat and test set."""
+    """Returns one row per hazard, size, sampling, repeat and test set."""
     cases: list[tuple[str, SubRMDP, ThreatConfig, float]] = [
         (
             "Circuit wall",
@@ -81,8 +81,8 @@ def run(config: Config) -> list[dict[str, Any]]:
     ]
     total = len(cases) * len(config.sizes) * config.repeats * len(build.SAMPLINGS)
     rows = []
-    with console.progress("sampling") as bar:
-        bar("", 0, total)
+    with terminal.progress() as bar:
+        bar("sampling", 0, total, "")
         for name, sub, tuned, x in cases:
             tests = test_sets(jax.random.key(99), sub, config, x)
             fit = dataclasses.replace(tuned.fit, steps=config.steps)
@@ -90,7 +90,12 @@ def run(config: Config) -> list[dict[str, Any]]:
                 for repeat in range(config.repeats):
                     for kind in build.SAMPLINGS:
                         settings = dataclasses.replace(
-                            tuned, states=size, sampling=kind, prudence=1.0, test_states=10, fit=fit
+                            tuned,
+                            states=size,
+                            sampling=kind,
+                            miss_rate=1.0,
+                            test_states=10,
+                            fit=fit,
                         )
                         built = build.build(jax.random.key(repeat), sub, settings, x)
                         for test, (features, true) in tests.items():
@@ -105,12 +110,12 @@ def run(config: Config) -> list[dict[str, Any]]:
                                     **report.compare(said, true, x),
                                 }
                             )
-                        bar("", len(rows) // 2, total)
+                        bar("sampling", len(rows) // 2, total, "")
     return rows
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Errors against the number of labelled states."""
+    """Draws errors against the number of labelled states."""
     from rp_jax.plot import curves
 
     curves.comparison(
@@ -124,17 +129,17 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def main() -> None:
-    """The command line."""
+    """Runs the command; exits with 2 on bad input."""
     config = tyro.cli(Config, description=__doc__)
-    with cli.bad_input():
+    with errors.bad_input():
         config.validate()
-        cli.needs_matplotlib()
+        errors.needs_matplotlib()
         folder = storage.new_folder(config.out)
-    with cli.bad_input():
+    with errors.bad_input():
         rows = run(config)
     storage.write_json(folder / "sampling.json", {"settings": config.__dict__, "rows": rows})
     plot(rows, folder / "sampling.png")
-    console.say(f"results: {folder}")
+    terminal.say(f"results: {folder}")
 
 
 if __name__ == "__main__":

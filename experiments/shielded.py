@@ -15,16 +15,24 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from experiments import cli, console, jam, pipeline, recipes, reconnaissance, tables, tasks
-from experiments.evaluation import ROUND
-from rp_jax import evaluate, storage
+from experiments import jam
+from rp_jax import evaluation, recipes, storage
 from rp_jax.adapters import brax
-from rp_jax.envs.base import Env, select
-from rp_jax.planning.pmdp import PMDP, not_finite
+from rp_jax.cli import errors, terminal
+from rp_jax.cli.experiment import Run, default_out, threats_of
+from rp_jax.envs import optional
+from rp_jax.envs.contract import Env, Outcome
+from rp_jax.planning.percept import not_finite
+from rp_jax.planning.pmdp import PMDP
+from rp_jax.rollout import Step, rollout
+from rp_jax.runs import tables, train
+from rp_jax.runs.plan import make_pmdp
+from rp_jax.runs.train import Process
+from rp_jax.streams import Stream, key_of
 from rp_jax.threat.build import ThreatConfig
 from rp_jax.validate import number
 
-EPISODES = 100  # stream of random numbers, apart from the pipeline's
+ROUND = 1000  # episodes side by side
 
 
 @dataclass(frozen=True)
@@ -42,11 +50,10 @@ class Config:
     wall: ThreatConfig = field(default_factory=lambda: recipes.TUNED_WALL)  # threat of a wall point
     obstacle: ThreatConfig = field(default_factory=lambda: recipes.TUNED_OBSTACLE)  # of an obstacle
 
-    def for_pipeline(self) -> jam.Config:
-        """The same, as experiments.jam has it."""
-        given = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        del given["steps"]
-        return jam.Config(**given)
+    def of_jam(self) -> jam.Config:
+        """Returns the same settings, as experiments.jam has them."""
+        own = {field.name for field in dataclasses.fields(jam.Config)}
+        return jam.Config(**{name: value for name, value in vars(self).items() if name in own})
 
 
 class Policy(NamedTuple):
@@ -58,22 +65,22 @@ class Policy(NamedTuple):
 
 
 def uniform(count: int) -> Policy:
-    """Scores at random: all actions alike, and under a shield all that are admissible."""
+    """Returns scores at random: all actions alike, and under a shield all that are admissible."""
     return Policy(lambda _, obs, key: jax.random.uniform(key, (len(obs), count)), None, None)
 
 
 def learned(env: Env, params: Any, config: Config) -> Policy:
-    """What brax's PPO learns from the reward alone."""
+    """Returns what brax's PPO learns from the reward alone."""
     from brax.training.agents.ppo import train as ppo
 
     adapted = brax.BraxEnv(env, params)
-    with console.progress("PPO of brax") as bar:
+    with terminal.progress() as bar:
 
         def tell(done: int, metrics: dict[str, Any]) -> None:
             note = f"return {metrics['eval/episode_reward']:.1f}"
-            bar("", min(done, config.steps), config.steps, note)
+            bar("PPO of brax", min(done, config.steps), config.steps, note)
 
-        bar("", 0, config.steps, "compiling")
+        bar("PPO of brax", 0, config.steps, "compiling")
         make, weights, _ = ppo.train(
             environment=adapted,
             wrap_env_fn=brax.wrap,
@@ -93,52 +100,98 @@ def learned(env: Env, params: Any, config: Config) -> Policy:
             progress_fn=tell,
         )
     act = lambda weights, obs, key: make(weights, deterministic=True)(obs, key)[0]  # noqa: E731
-    return Policy(act, weights, params.agent.shares)
+    return Policy(act, weights, params.body.normalized_actions)
 
 
-def played(key: jax.Array, pmdp: PMDP, weights: Any, policy: Policy, discrete: bool) -> Any:
-    """ROUND episodes of the shielded brax environment, or of the bare one if not `discrete`."""
-    env = brax.training.VmapWrapper(brax.BraxEnv(pmdp.env, pmdp.params))
+class BraxWorld(NamedTuple):
+    """A batched brax environment, as `rollout` plays in it."""
+
+    env: Any  # of brax
+
+    def perceive(self, states: Any, alive: Any = None) -> Any:
+        """Returns the observations of states (B,)."""
+        return states.obs
+
+    def advance(self, keys: Any, states: Any, actions: Any) -> tuple[Any, Outcome]:
+        """Makes one transition of each state (B,), whose random keys are its own."""
+        reached = self.env.step(states, actions)
+        return reached, Outcome(
+            reward=reached.reward,
+            danger=reached.info["cost"],
+            terminated=reached.done > 0,
+            truncated=reached.info["truncation"] > 0,
+            goal=reached.metrics["goal"] > 0,
+        )
+
+
+def played(
+    key: jax.Array, pmdp: PMDP, weights: Any, policy: Policy, discrete: bool
+) -> evaluation.Episodes:
+    """Plays ROUND episodes of the shielded brax environment, or of the bare one.
+
+    Args:
+        key: of the episodes.
+        pmdp: the environment, and what is admissible.
+        weights: of the policy.
+        policy: chooses the actions.
+        discrete: whether actions are those of the table, as a shield needs them.
+    """
+    env, params = brax.training.VmapWrapper(brax.BraxEnv(pmdp.env, pmdp.params)), pmdp.params
     if discrete:
         threat = lambda state: pmdp.threat(state.pipeline_state, state.done == 0)  # noqa: E731
         env = brax.Shielded(env, threat, pmdp.x, policy.table)
-    start_key, act_key = jax.random.split(key)
-    state = env.reset(jax.random.split(start_key, ROUND))
-    rows = evaluate.blank(pmdp.env, state.pipeline_state, pmdp.params)
-    never = jnp.zeros(ROUND)
+    start_key, play_key = jax.random.split(key)
+    starts = env.reset(jax.random.split(start_key, ROUND))
+    no = jnp.zeros(ROUND, bool)
 
-    def advance(carry):
-        t, alive, state, rows = carry
-        action = policy.act(weights, state.obs, jax.random.fold_in(act_key, t))
-        reached = env.step(state, action)
-        hit = jax.vmap(pmdp.env.causes, (0, None))(reached.pipeline_state, pmdp.params)
-        new = evaluate.Episodes(
-            score=reached.reward,
-            danger=reached.info["cost"],
-            goal=reached.metrics["goal"] > 0,
-            length=alive,
-            interventions=reached.info.get("intervention", never) > 0,
-            insecure=reached.info.get("insecure", never) > 0,
-            causes=hit,
-            bad_observations=not_finite(state.obs),
-            bad_threats=never > 0,  # the shield's own
+    def act(key: jax.Array, seen: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return policy.act(weights, seen, key), no
+
+    def fold(rows: evaluation.Episodes, step: Step) -> evaluation.Episodes:
+        told, states = step.reached.info, step.reached.pipeline_state
+        hits = functools.partial(optional.collisions, pmdp.env)
+        new = evaluation.Episodes(
+            score=step.outcome.reward,
+            danger=step.outcome.danger,
+            goal=step.outcome.goal,
+            length=step.moved,
+            interventions=told.get("intervention", no) > 0,
+            insecure=told.get("insecure", no) > 0,
+            collisions=jax.vmap(hits, (0, None))(states, params),
+            bad_observations=not_finite(step.percept),
+            bad_threats=no,  # the shield's own
         )
-        ended = (reached.done + reached.info["truncation"]) > 0
-        kept = jax.vmap(select)(alive, reached, state)
-        return t + 1, alive & ~ended, kept, evaluate.added(rows, new, alive)
+        return evaluation.added(rows, new, step.moved)
 
-    carry = (jnp.asarray(0), jnp.ones(ROUND, bool), state, rows)
-    return jax.lax.while_loop(lambda c: jnp.any(c[1]), advance, carry)[3]
+    none = evaluation.no_episodes(pmdp.env, starts.pipeline_state, params)
+    return rollout(play_key, BraxWorld(env), act, starts, fold, none)[1]
 
 
-def compare(config: Config, task: tasks.Task, folder: Path) -> list[dict[str, Any]]:
-    """One row per policy, without the shield and with it."""
-    settings = config.for_pipeline()
-    models, _, _ = reconnaissance.learn_threats(task, settings, folder)
-    guarded = tasks.make_pmdp(task, settings, models, task.train)
-    free = guarded.replace(threats=None, x=jnp.asarray(jnp.inf))
-    random = uniform(task.env.num_actions(task.train))
-    ppo = learned(task.env, task.train, config)
+def prepared(config: Config) -> Run:
+    """Returns the run whose threat function is used, checked, but for its folder.
+
+    Raises:
+        ValueError: a setting is out of range, or a file cannot be used.
+    """
+    number("steps", config.steps, least=1, most=10**9, integer=True)
+    settings = config.of_jam()
+    world = jam.make_world(settings)
+    threats, process = threats_of(settings), Process(threat=config.threat, figures=False)
+    train.checked(world, settings, threats, process)
+    return Run(world, settings, threats, process, Path())
+
+
+def compare(config: Config, run: Run) -> list[dict[str, Any]]:
+    """Returns one row per policy, without the shield and with it."""
+    env, params = run.world.env, run.world.params()
+    with terminal.progress() as bar:
+        threat = train.threat_of(
+            jax.random.key(0), run.world, run.config, run.threats, run.folder, run.process, bar
+        )
+    guarded = make_pmdp(env, params, threat, x=config.x)
+    free = make_pmdp(env, params, None, x=float("inf"))
+    random = uniform(optional.num_actions(env, params))
+    ppo = learned(env, params, config)
     shielded = f"x = {config.x:g}"
     cases = [  # the nearest row of the table stands for a continuous action
         ("random", "none", random, free, True),
@@ -148,25 +201,26 @@ def compare(config: Config, task: tasks.Task, folder: Path) -> list[dict[str, An
         ("PPO, nearest row", shielded, ppo, guarded, True),
     ]
     rounds = -(-config.episodes // ROUND)
-    keys = jax.random.split(tasks.key_of(config.seed, EPISODES), rounds)
+    keys = jax.random.split(key_of(jax.random.key(config.seed), Stream.ADAPTERS), rounds)
     rows: list[dict[str, Any]] = []
-    with console.progress("episodes") as bar:
+    with terminal.progress() as bar:
+        total = len(cases) * rounds
         for name, shown, policy, pmdp, discrete in cases:
             play = jax.jit(functools.partial(played, policy=policy, discrete=discrete))
             found: list[Any] = []
             for key in keys:
-                bar("", len(rows) * rounds + len(found), len(cases) * rounds, f"{name}, {shown}")
+                bar("episodes", len(rows) * rounds + len(found), total, f"{name}, {shown}")
                 found.append(jax.tree.map(np.asarray, play(key, pmdp, policy.weights)))
             every = jax.tree.map(lambda *a: np.concatenate(a)[: config.episodes], *found)
-            evaluate.check(every, name)
-            found_of = evaluate.summarise(every, settings.penalty)
+            evaluation.check(every, name)
+            found_of = evaluation.summarise(every, run.config.penalty)
             rows.append({"policy": name, "shield": shown, **found_of})
-        bar("", len(cases) * rounds, len(cases) * rounds)
+        bar("episodes", total, total, "")
     return rows
 
 
 def show(rows: Sequence[dict[str, Any]]) -> None:
-    """The table on the terminal."""
+    """Prints the table."""
     shown = [
         {
             "policy": row["policy"],
@@ -179,23 +233,21 @@ def show(rows: Sequence[dict[str, Any]]) -> None:
         for row in rows
     ]
     title = f"Jam in brax, {rows[0]['episodes']:,} episodes each"
-    console.table(title, shown, list(shown[0]))
+    terminal.table(title, shown, list(shown[0]))
 
 
 def main(argv: Sequence[str] | None = None) -> Path:
-    """The command line."""
+    """Runs the command; exits with 2 on bad input."""
     config = tyro.cli(Config, args=argv, description=__doc__)
-    with cli.bad_input():
-        number("steps", config.steps, least=1, most=10**9, integer=True)
-        out = config.out or pipeline.default_out("shielded", "jam")
-        settings = dataclasses.replace(config.for_pipeline(), out=out)
-        task, folder = pipeline.prepare(jam.make_task, settings, "shielded")
-    with cli.bad_input():
-        rows = compare(config, task, folder)
+    with errors.bad_input():
+        run = prepared(config)
+        folder = storage.new_folder(config.out or default_out("shielded-jam"))
+    with errors.bad_input():
+        rows = compare(config, run._replace(folder=folder))
     show(rows)
     storage.write_json(folder / "config.json", dataclasses.asdict(config))
     storage.write_json(folder / "table.json", rows)
-    console.say(f"results: {folder}")
+    terminal.say(f"results: {folder}")
     return folder
 
 

@@ -14,8 +14,8 @@ import jax
 import numpy as np
 import tyro
 
-from experiments import cli, console
 from rp_jax import storage
+from rp_jax.cli import errors, terminal
 from rp_jax.tabular import verify
 from rp_jax.validate import number
 
@@ -43,7 +43,7 @@ class Config:
 
 
 def programs(config: Config, horizon: int | None) -> dict[str, Callable[[Any], Any]]:
-    """From a key to violations: of all theorems, and of Theorem 3 with two hazards."""
+    """Returns functions from a key to violations: of all theorems, of Theorem 3 for two hazards."""
     return {
         "CMDPs": functools.partial(
             verify.violations, states=config.states, actions=config.actions, horizon=horizon
@@ -55,10 +55,10 @@ def programs(config: Config, horizon: int | None) -> dict[str, Callable[[Any], A
 
 
 def run(config: Config) -> list[dict[str, Any]]:
-    """One row per theorem and horizon, in double precision."""
+    """Returns one row per theorem and horizon, in double precision."""
     each = -(-config.instances // len(HORIZONS))
     rows = []
-    with console.progress("theorems") as bar, jax.enable_x64(True):
+    with terminal.progress("theorems") as bar, jax.enable_x64(True):
         for h, horizon in enumerate(HORIZONS):
             for p, (kind, program) in enumerate(programs(config, horizon).items()):
                 many = jax.jit(jax.vmap(program))
@@ -74,7 +74,7 @@ def run(config: Config) -> list[dict[str, Any]]:
                     for name, values in batch.items():
                         found.setdefault(name, []).append(values[: each - start])
                     done = min(start + BATCH, each)
-                    bar(f"T = {horizon or 'infinite'}, {kind}", done, each)
+                    bar(f"T = {horizon or 'infinite'}, {kind}", done, each, "")
                 for name, parts in found.items():
                     rows.append({"theorem": name, "horizon": horizon, **counted(parts)})
                     rows[-1]["per_second"] = (each - BATCH) / seconds if seconds else None
@@ -82,7 +82,7 @@ def run(config: Config) -> list[dict[str, Any]]:
 
 
 def counted(parts: list[np.ndarray]) -> dict[str, Any]:
-    """How many instances there were, and how many violations; nan is one."""
+    """Counts the instances and the violations; nan is one."""
     values = np.concatenate(parts)
     return {
         "instances": len(values),
@@ -94,9 +94,9 @@ def counted(parts: list[np.ndarray]) -> dict[str, Any]:
 def main() -> None:
     """Exits with 1 on a violation, unless the rows that tell of it are written to a file."""
     config = tyro.cli(Config, description=__doc__)
-    with cli.bad_input():
+    with errors.bad_input():
         config.validate()
-        cli.needs_folder(config.out)
+        errors.needs_folder(config.out)
     rows = run(config)
     shown = [
         {
@@ -108,7 +108,7 @@ def main() -> None:
         }
         for row in rows
     ]
-    console.table(f"violations above {ROUNDING:g}", shown, list(shown[0]))
+    terminal.table(f"violations above {ROUNDING:g}", shown, list(shown[0]))
     if config.out is not None:
         storage.write_json(config.out, rows)
     elif any(row["violations"] for row in rows):

@@ -13,10 +13,11 @@ import numpy as np
 import tyro
 from jax import Array
 
-from experiments import cli, tables, tasks
-from experiments.runs import EXPERIMENTS
+from experiments.tasks import EXPERIMENTS
 from rp_jax import storage
-from rp_jax.threat import artefact, report
+from rp_jax.cli import errors, results
+from rp_jax.threat import report
+from rp_jax.threat.function import load_threat
 from rp_jax.threat.model import ThreatModel
 from rp_jax.validate import one_of
 
@@ -34,7 +35,7 @@ class Config:
 
 
 def features_of(states: np.ndarray) -> Array:
-    """(n, F) features of recorded states (x, y, [relative heading, other speed,] own speed)."""
+    """Returns features (n, F) of states (x, y, [relative heading, other speed,] own speed)."""
     if states.shape[1] == 3:
         return jnp.asarray(states, jnp.float32)
     x, y, turn, other, own = states.T
@@ -43,7 +44,7 @@ def features_of(states: np.ndarray) -> Array:
 
 
 def compare(model: ThreatModel, recorded: Path, x: float) -> dict[str, dict[str, float]]:
-    """Errors on each set of states in a file of recorded threats; sets end alike, as in `_near`."""
+    """Returns the errors on each set of states in a file; names end alike, as in `_near`."""
     try:
         with np.load(recorded) as file:
             data = dict(file)
@@ -61,24 +62,24 @@ def compare(model: ThreatModel, recorded: Path, x: float) -> dict[str, dict[str,
 
 
 def run(config: Config) -> list[dict[str, Any]]:
-    """One row per hazard and set of states."""
+    """Returns one row per hazard and set of states, and prints them."""
     module = EXPERIMENTS[one_of("env", config.env, ("circuit", "jam"))]
     settings = module.quick("tuned")
-    task: tasks.Task = module.make_task(settings)
-    models = artefact.load(config.threat, config.env, task.env.sub_rmdps(task.train))
+    world = module.make_world(settings)
+    threat = load_threat(config.threat, world.env.sub_rmdps(world.params()))
     rows = []
-    for kind, model in models.items():
+    for kind, model in threat.models.items():
         path = config.data / f"threat_truth_{config.env}_{RECORDED[kind]}.npz"
         for name, found in compare(model, path, settings.x).items():
             rows.append({"hazard": kind, "of": name, **found})
-    tables.show_threats(rows, settings.x, "recorded threats")
+    results.show_threats(rows, settings.x, "recorded threats")
     return rows
 
 
 if __name__ == "__main__":
     chosen = tyro.cli(Config, description=__doc__)
-    with cli.bad_input():
-        cli.needs_folder(chosen.out)
+    with errors.bad_input():
+        errors.needs_folder(chosen.out)
         found = run(chosen)
         if chosen.out is not None:
             storage.write_json(chosen.out, found)

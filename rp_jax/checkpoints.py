@@ -1,4 +1,4 @@
-"""Loops that go on where they were interrupted, to the same bits."""
+"""Loops that continue where they were interrupted, with bit-identical results."""
 
 import shutil
 import signal
@@ -15,34 +15,47 @@ from rp_jax import storage
 State = TypeVar("State")
 
 KIND = "checkpoint"
-LAST = 2  # checkpoints of a loop that are kept
+LAST = 2  # how many checkpoints of a loop are kept
 INTERVAL = 60.0  # seconds between two checkpoints of a loop, at least
-SHARE = 0.01  # of a loop's time that goes into checkpoints, at most
+SHARE = 0.01  # greatest share of a loop's time that may go into writing checkpoints
 
 
 def chunks_of(units: int, most: int) -> tuple[int, int]:
-    """(chunks, units of each): at most so many, all alike, of at least `units` together."""
+    """Returns how to divide work into chunks of equal size.
+
+    Args:
+        units: number of units of work.
+        most: greatest allowed number of chunks.
+
+    Returns:
+        (chunks, length): the number of chunks, and the number of units in each; together they hold
+        at least `units`.
+    """
     length = -(-units // most)
     return -(-units // length), length
 
 
 @dataclass(frozen=True)
 class Checkpoints:
-    """A folder with the checkpoints of one loop, or with such folders; or none."""
+    """A folder that holds the checkpoints of a loop, or of several loops in subfolders; or none."""
 
-    folder: Path | None
-    run: str = ""  # checksum of the settings that the checkpoints hold for
-    name: str = ""  # of the loop, for messages
-    say: Callable[[str], None] = print
+    folder: Path | None  # None: no checkpoints are written or read
+    run: str = ""  # checksum of the settings; a checkpoint with another one is refused
+    name: str = ""  # the loop's name, for messages
+    say: Callable[[str], None] = print  # receives messages for the user
 
     def at(self, name: str) -> "Checkpoints":
-        """Those of one part of a job."""
+        """Returns the checkpoints of one part of the work, in a subfolder.
+
+        Args:
+            name: the part's name, which is the subfolder's as well.
+        """
         if self.folder is None:
             return self
         return replace(self, folder=self.folder / name, name=f"{self.name} {name}".strip())
 
     def begun(self) -> bool:
-        """Whether there is any checkpoint in the folder, or in a folder of it."""
+        """Returns whether there is a checkpoint in the folder or in any of its subfolders."""
         return self.folder is not None and any(_by_age(p) for p in self.folder.glob("**/"))
 
     def loop(
@@ -52,22 +65,27 @@ class Checkpoints:
         length: int,
         result: Callable[[State], Any] = lambda state: state,
     ) -> Any:
-        """`result` of the state after `step(i, state)` for i from 0 to `length` - 1.
+        """Runs a loop, skipping the steps that a checkpoint already holds.
 
-        Steps that a checkpoint already holds are not repeated. A checkpoint is written between
-        steps, every `INTERVAL` seconds or less often; of the end, `result` alone is kept. On
-        Ctrl-C the step is finished first and a checkpoint written.
+        A checkpoint is written between steps, every `INTERVAL` seconds or less often; the last one
+        holds only `result` of the final state. On Ctrl-C the current step is finished and a
+        checkpoint is written; a second Ctrl-C stops at once.
 
         Args:
-            state: a pytree of arrays and keys, the same in every process.
-            step: may change the state in place.
+            state: the state before the first step, a pytree of arrays and keys; it must be the same
+                in every process that continues the loop.
+            step: maps the step's number, from 0 to `length` - 1, and a state to the next state; it
+                may change the state in place.
             length: number of steps.
-            result: picks a part of a state; nothing is computed.
+            result: picks the part of a state that is returned; it must not compute anything.
+
+        Returns:
+            `result` of the state after the last step.
 
         Raises:
-            KeyboardInterrupt: with what is done, for the user.
-            storage.StorageError: a checkpoint cannot be written (the older ones are whole), or is
-                of a run with other settings.
+            KeyboardInterrupt: the user pressed Ctrl-C; the message says how many steps are done.
+            storage.StorageError: a checkpoint cannot be written (older ones are still valid), or
+                was written by a run with other settings.
         """
         if self.folder is None:
             for i in range(length):
@@ -91,11 +109,12 @@ class Checkpoints:
         return result(state)
 
     def clear(self) -> None:
-        """Removes all of them: the job is done."""
+        """Removes all checkpoints, once the work is done."""
         if self.folder is not None:
             shutil.rmtree(self.folder)
 
     def _save(self, done: int, length: int, state: Any) -> None:
+        """Writes a checkpoint and removes all but the newest ones."""
         assert self.folder is not None
         about = {"run": self.run, "loop": self.name, "done": done, "of": length}
         storage.save(self.folder / f"{done:08d}", KIND, state, about)
@@ -103,7 +122,12 @@ class Checkpoints:
             shutil.rmtree(old, ignore_errors=True)
 
     def _newest(self, state: Any, length: int, result: Callable[[Any], Any]) -> tuple[int, Any]:
-        """(steps done, the state or at the end the result) of the newest whole checkpoint."""
+        """Returns the newest checkpoint that is not damaged.
+
+        Returns:
+            (steps done, state); after the last step the result in place of the state, and without
+            any checkpoint (0, the given state).
+        """
         assert self.folder is not None
         for path in _by_age(self.folder):
             try:
@@ -126,13 +150,17 @@ NO_CHECKPOINTS = Checkpoints(None)
 
 
 def _by_age(folder: Path) -> list[Path]:
-    """The newest first."""
+    """Returns the checkpoints in a folder, the newest first."""
     return sorted((p for p in folder.glob("*") if p.name.isdecimal()), reverse=True)
 
 
 @contextmanager
 def _deferred_interrupt(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
-    """Asks whether Ctrl-C was pressed. The first one waits, the second one is as usual."""
+    """Holds back the first Ctrl-C; a second one acts as usual.
+
+    Yields:
+        A function that returns whether Ctrl-C was pressed.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return

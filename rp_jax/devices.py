@@ -1,6 +1,6 @@
-"""Rows side by side on all devices, of one process or of many: seeds, rollouts, episodes.
+"""Batches spread over all devices, of one process or of many: seeds, rollouts, episodes.
 
-Every process runs the same program on the same input; what comes back is the same for all.
+Every process runs the same program on the same input, and gets the same result back.
 """
 
 import os
@@ -12,18 +12,20 @@ from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-DEVICES = ("one", "all", "cluster")
-ROWS = "rows"  # the only axis of a mesh
+DEVICES = ("one", "all", "cluster")  # choices: one device, all of this machine, many machines
+ROWS = "rows"  # name of the mesh's only axis
 
 
 def connect(devices: str) -> None:
-    """Joins the other processes of a cluster; call it before anything else asks for a device.
+    """Joins the other processes of a cluster.
 
-    Slurm, Open MPI, Kubernetes and Cloud TPU tell JAX who they are. Elsewhere each process is told
-    by JAX_COORDINATOR_ADDRESS (HOST:PORT of process 0), JAX_NUM_PROCESSES and JAX_PROCESS_ID.
+    To be called before anything else asks JAX for a device. Slurm, Open MPI, Kubernetes and Cloud
+    TPU tell JAX about the cluster by themselves. Elsewhere each process has to be told by the
+    environment variables JAX_COORDINATOR_ADDRESS (HOST:PORT of process 0), JAX_NUM_PROCESSES and
+    JAX_PROCESS_ID.
 
     Args:
-        devices: one of `DEVICES`; does nothing unless "cluster".
+        devices: one of `DEVICES`; unless it is "cluster", nothing is done.
 
     Raises:
         ValueError: no cluster is found, or it does not answer.
@@ -44,14 +46,30 @@ def connect(devices: str) -> None:
 
 
 def mesh_of(devices: str) -> Mesh | None:
-    """All devices of all connected processes in a line; None for one device."""
+    """Returns a mesh of all devices of all connected processes in a line.
+
+    Args:
+        devices: one of `DEVICES`.
+
+    Returns:
+        The mesh, with the single axis `ROWS`; None for "one".
+    """
     if devices == "one":
         return None
     return jax.make_mesh((jax.device_count(),), (ROWS,), axis_types=(AxisType.Auto,))
 
 
 def divides(field: str, rows: int, mesh: Mesh | None) -> None:
-    """Raises ValueError, naming the field, if rows cannot be shared out evenly."""
+    """Raises ValueError unless a number of rows can be divided evenly among the devices.
+
+    Args:
+        field: name of the number, for the message.
+        rows: number of rows.
+        mesh: the devices; None for one device, which any number suits.
+
+    Raises:
+        ValueError: the number is not a multiple of the number of devices.
+    """
     if mesh is not None and rows % mesh.size:
         raise ValueError(
             f"{field} is {rows}; with {mesh.size} devices it must be a multiple of {mesh.size}"
@@ -59,33 +77,45 @@ def divides(field: str, rows: int, mesh: Mesh | None) -> None:
 
 
 def _specs(in_axes: Any) -> Any:
-    """Partitions for the arguments of a vmap."""
+    """Returns the partitions of arguments whose vmapped axes are `in_axes`."""
     spec = lambda axis: P() if axis is None else P(ROWS)  # noqa: E731
     return jax.tree.map(spec, in_axes, is_leaf=lambda axis: axis is None)
 
 
 def spread(function: Callable, in_axes: Any, mesh: Mesh | None) -> Callable:
-    """`jax.vmap(function, in_axes)` whose rows are shared out over the devices of the mesh.
+    """Returns `jax.vmap(function, in_axes)` with its rows spread over the devices of a mesh.
 
-    Each device runs the vmapped program on its own rows, without a word to the others.
+    Each device runs the vmapped program on its own rows, without communication.
 
     Args:
-        function: of arrays, with results that are arrays.
-        in_axes: as of `jax.vmap`, a tuple; axes must be 0 or None.
-        mesh: None leaves everything on one device.
+        function: takes and returns pytrees of arrays.
+        in_axes: as for `jax.vmap`; a tuple whose axes are 0 or None.
+        mesh: the devices; None leaves everything on one device.
     """
     mapped = jax.vmap(function, in_axes)
     return mapped if mesh is None else share_out(mapped, in_axes, mesh)
 
 
 def share_out(function: Callable, in_axes: Any, mesh: Mesh) -> Callable:
-    """A function of whole batches, of which each device gets its own part; see `spread`."""
+    """Returns a function of whole batches that gives each device a part of the rows.
+
+    Args:
+        function: takes and returns whole batches, pytrees of arrays with a leading axis.
+        in_axes: 0 for each argument with rows, None for each that all devices get whole.
+        mesh: the devices.
+    """
     specs = _specs(in_axes)
     return jax.shard_map(function, mesh=mesh, in_specs=specs, out_specs=P(ROWS), check_vma=False)
 
 
 def place(arguments: tuple, in_axes: Any, mesh: Mesh | None) -> tuple:
-    """The arguments of a `spread` function where it wants them."""
+    """Returns the arguments of a `spread` function, moved to the devices that need them.
+
+    Args:
+        arguments: what the function will be called with.
+        in_axes: as given to `spread`.
+        mesh: as given to `spread`.
+    """
     if mesh is None:
         return arguments
     shardings = jax.tree.map(lambda spec: NamedSharding(mesh, spec), _specs(in_axes))
@@ -93,12 +123,17 @@ def place(arguments: tuple, in_axes: Any, mesh: Mesh | None) -> tuple:
 
 
 def _same(*arguments: Any) -> tuple:
-    """By name, so that it is compiled once for all calls alike."""
+    """Returns its arguments; a named function, so that similar calls share one compilation."""
     return arguments
 
 
 def placed(shapes: Any, mesh: Mesh | None) -> Any:
-    """The shapes of rows, as they come out of a `spread` function."""
+    """Returns shapes of rows together with the devices on which a `spread` function leaves them.
+
+    Args:
+        shapes: pytree of `jax.ShapeDtypeStruct`, each with a leading axis of rows.
+        mesh: as given to `spread`; None returns the shapes unchanged.
+    """
     if mesh is None:
         return shapes
     sharding = NamedSharding(mesh, P(ROWS))
@@ -107,12 +142,22 @@ def placed(shapes: Any, mesh: Mesh | None) -> Any:
 
 
 def returned(rows: Any, mesh: Mesh | None) -> Any:
-    """Rows that were read from a file where a `spread` function leaves them; others as they are."""
+    """Moves rows to the devices on which a `spread` function would have left them.
+
+    Args:
+        rows: pytree of arrays with a leading axis, for example read from a file.
+        mesh: as given to `spread`; None returns the rows unchanged.
+    """
     return rows if mesh is None else jax.device_put(rows, NamedSharding(mesh, P(ROWS)))
 
 
 def gather(rows: Any, mesh: Mesh | None) -> Any:
-    """All rows in the memory of every process."""
+    """Returns all rows in the memory of every process.
+
+    Args:
+        rows: result of a `spread` function.
+        mesh: as given to `spread`; None returns the rows unchanged.
+    """
     if mesh is None:
         return rows
     if one_process():
@@ -121,15 +166,21 @@ def gather(rows: Any, mesh: Mesh | None) -> Any:
 
 
 def agreed(tree: Any) -> Any:
-    """The first process's values, on every process: machines may differ in the last bits."""
+    """Returns the first process's values on every process.
+
+    Machines may differ in the last bits of what they compute; after this call they do not.
+
+    Args:
+        tree: pytree of arrays, computed by every process.
+    """
     return tree if one_process() else multihost_utils.broadcast_one_to_all(tree)
 
 
 def one_process() -> bool:
-    """Whether there are no others, so that all rows are within reach."""
+    """Returns whether this is the only process, which then holds all rows."""
     return jax.process_count() == 1
 
 
 def is_first() -> bool:
-    """Whether this is the process that writes the results."""
+    """Returns whether this is the process that writes the results."""
     return jax.process_index() == 0

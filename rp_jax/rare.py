@@ -1,10 +1,10 @@
-"""How often a policy crashes that hardly ever does: multilevel splitting, without bias.
+"""Unbiased estimates of very small crash probabilities by multilevel splitting.
 
-Every crash of a shielded agent comes after states in which the least threat of any action grows.
-Episodes that reach a level of it are split there: the way on is simulated more often, and the
-rates from level to level are multiplied. Fixed effort; see Garvels (2000), section 2, and L'Ecuyer,
-Demers, Tuffin (2007), section 3.1: the product's mean is the crash probability for any choice of
-levels made beforehand.
+Before every crash of a shielded agent the least threat of any action grows. An episode in which it
+reaches a level is split there: it is continued several times, and the rates of getting from one
+level to the next are multiplied. The number of paths per level is fixed (Garvels 2000, section 2;
+L'Ecuyer, Demers and Tuffin 2007, section 3.1); the mean of the product is the crash probability for
+any choice of levels made beforehand.
 """
 
 import functools
@@ -17,22 +17,23 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rp_jax import shield
-from rp_jax.envs.base import select
-from rp_jax.planning.pmdp import PMDP, Percept, faults
+from rp_jax.evaluation import shielded
+from rp_jax.planning.percept import Percept, faults
+from rp_jax.planning.pmdp import PMDP
+from rp_jax.rollout import Step, rollout
 
-Values = Callable[[Percept], Array]
-SHARE = 0.2  # of the paths, that reach one level from the one before
+Values = Callable[[Percept], Array]  # maps a batch of percepts to scores (B, A) of the actions
+SHARE = 0.2  # share of the paths that should reach each level from the one before
 MOST_LEVELS = 12
 
 
 class Paths(NamedTuple):
-    """Episodes under way, leading axis (B,)."""
+    """A batch of episodes under way, leading axis (B,)."""
 
-    states: Any  # where they are
-    starts: Any  # where they began
-    highest: Array  # (B,) greatest least threat on the way so far
-    crashed: Array  # (B,) bool; there the path ends, even if the episode would go on
+    states: Any  # the environment's current states
+    starts: Any  # the states in which the episodes began
+    highest: Array  # (B,) greatest value so far of the least threat of any action
+    crashed: Array  # (B,) bool; a crash ends the path, even if the episode would continue
     reached: Array  # (B,) bool, the level of the last stage was reached, or the episode crashed
     length: Array  # (B,) int32, steps simulated in the last stage
     bad: Array  # (B,) bool, an observation or a threat was nan or infinite on the way
@@ -40,13 +41,27 @@ class Paths(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames="count")
 def begin(key: Array, pmdp: PMDP, count: int) -> Paths:
-    """Fresh episodes, (count,)."""
+    """Starts new episodes.
+
+    Args:
+        key: random key for the starts.
+        pmdp: the environment, the threats and the threshold.
+        count: number of episodes.
+
+    Returns:
+        Paths with leading axis (count,).
+    """
     states = jax.vmap(pmdp.env.reset, (0, None))(jax.random.split(key, count), pmdp.params)
     return from_starts(states, pmdp)
 
 
 def from_starts(states: Any, pmdp: PMDP) -> Paths:
-    """Episodes from given states, leading axis (B,)."""
+    """Returns paths that begin in given states.
+
+    Args:
+        states: states of the environment, leading axis (B,).
+        pmdp: the environment, the threats and the threshold.
+    """
     count = states.time.shape[0]
     no = jnp.zeros(count, bool)
     zero = jnp.zeros(count, pmdp.x.dtype)
@@ -54,48 +69,57 @@ def from_starts(states: Any, pmdp: PMDP) -> Paths:
 
 
 def advance(key: Array, paths: Paths, pmdp: PMDP, values: Values, level: Array) -> Paths:
-    """Plays each path on until its least threat is at least `level`, it crashes, or it ends.
+    """Continues each path until its least threat reaches a level, it crashes, or it ends.
 
     Args:
-        key: of the environment's randomness.
-        paths: with leading axis (B,).
+        key: random key for the environment's transitions.
+        paths: the paths, leading axis (B,).
         pmdp: the environment, the threats and the threshold.
-        values: scores the actions, as in `evaluate.run_episodes`.
-        level: () of the least threat; infinity: until a crash.
-    """
-    count = paths.highest.shape[0]
-    keys = jax.random.split(key, count)
+        values: scores the actions; the best admissible one is taken.
+        level: () level of the least threat of any action; infinity continues until a crash.
 
-    def step(carry):
-        t, alive, paths = carry
-        percept = pmdp.perceive(paths.states, alive)
-        least = jnp.where(alive, jnp.min(percept.threat, axis=-1), 0.0)
-        there = alive & (least >= level)
-        alive = alive & ~there
-        action = jax.vmap(shield.masked_argmax)(values(percept), percept.admissible)
-        now = jax.vmap(jax.random.fold_in, (0, None))(keys, t)
-        move = jax.vmap(pmdp.env.step, (0, 0, 0, None))
-        states, outcome = move(now, paths.states, action, pmdp.params)
-        bad_observation, bad_threat = faults(percept.encoded, percept.threat)
-        crashed = alive & (outcome.danger > 0)
-        paths = Paths(
-            states=jax.vmap(select)(alive, states, paths.states),
-            starts=paths.starts,
+    Returns:
+        The paths where they stopped.
+    """
+    none = jnp.zeros(paths.highest.shape, jnp.int32)
+    blank = paths._replace(reached=paths.crashed, length=none)
+
+    def there(_: Array, percept: Percept) -> Array:
+        return jnp.min(percept.threat, axis=-1) >= level
+
+    def fold(paths: Paths, step: Step) -> Paths:
+        least = jnp.where(step.alive, jnp.min(step.percept.threat, axis=-1), 0.0)
+        crashed = step.moved & (step.outcome.danger > 0)
+        bad_observation, bad_threat = faults(step.percept.encoded, step.percept.threat)
+        return paths._replace(
             highest=jnp.maximum(paths.highest, least),
             crashed=paths.crashed | crashed,
-            reached=paths.reached | there | crashed,
-            length=paths.length + alive,
-            bad=paths.bad | (alive & (bad_observation | bad_threat)),
+            reached=paths.reached | (step.alive & ~step.moved) | crashed,
+            length=paths.length + step.moved,
+            bad=paths.bad | (step.moved & (bad_observation | bad_threat)),
         )
-        return t + 1, alive & ~outcome.done & ~crashed, paths
 
-    blank = paths._replace(reached=paths.crashed, length=jnp.zeros(count, jnp.int32))
-    carry = (jnp.asarray(0), ~paths.crashed, blank)
-    return jax.lax.while_loop(lambda c: jnp.any(c[1]), step, carry)[2]
+    states, found = rollout(
+        key,
+        pmdp,
+        shielded(values),
+        paths.states,
+        fold,
+        blank,
+        alive=~paths.crashed,
+        stop=there,
+        over=lambda outcome: outcome.done | (outcome.danger > 0),
+    )
+    return found._replace(states=states)
 
 
 def resample(key: Array, paths: Paths) -> Paths:
-    """As many paths, each a copy of one of those that reached the level; at least one must."""
+    """Returns as many paths again, each a copy of a random one that reached the level.
+
+    Args:
+        key: random key for the choice.
+        paths: the paths after a stage, leading axis (B,); at least one must have reached the level.
+    """
     odds = paths.reached / jnp.maximum(jnp.sum(paths.reached), 1)
     count = paths.highest.shape[0]
     chosen = jax.random.choice(key, count, (count,), p=odds)
@@ -103,15 +127,20 @@ def resample(key: Array, paths: Paths) -> Paths:
 
 
 def risks(key: Array, states: Any, actions: Array, pmdp: PMDP, values: Values, tries: int) -> Array:
-    """(n, a) share of `tries` episodes that crash which go on by an action, then by the policy.
+    """Returns how likely a crash is after each of several actions.
 
     Args:
-        key: of the environment's randomness.
-        states: leading axis (n,), of which no episode has ended.
-        actions: (n, a) int, tried in each of the states.
+        key: random key for the environment's transitions.
+        states: states of the environment, leading axis (n,), in none of which the episode has
+            ended.
+        actions: (n, a) int, the actions to try in each state.
         pmdp: the environment, the threats and the threshold.
-        values: scores the actions of the policy, as in `evaluate.run_episodes`.
-        tries: episodes for each state and action.
+        values: scores the actions of the policy that follows the first action; the best admissible
+            one is taken.
+        tries: number of episodes for each state and action.
+
+    Returns:
+        (n, a) shares of these episodes that crash.
     """
     first, onward = jax.random.split(key)
 
@@ -124,18 +153,18 @@ def risks(key: Array, states: Any, actions: Array, pmdp: PMDP, values: Values, t
     reached, outcome = jax.tree.map(lambda a: a.reshape(-1, *a.shape[3:]), after)
     crashed = outcome.danger > 0
     over = crashed | outcome.done
-    paths = from_starts(reached, pmdp)._replace(crashed=over)  # those stay where they are
+    paths = from_starts(reached, pmdp)._replace(crashed=over)  # marked paths stay where they are
     found = advance(onward, paths, pmdp, values, jnp.asarray(jnp.inf, pmdp.x.dtype)).crashed
     return jnp.mean(jnp.where(over, crashed, found).reshape(*actions.shape, tries), axis=-1)
 
 
 class Splitting(NamedTuple):
-    """One run of the estimator."""
+    """The result of one run of the estimator."""
 
     estimate: float  # probability that an episode crashes
-    rates: list[float]  # of reaching each level from the one before, and last a crash
-    steps: int  # simulated
-    starts: Any  # (k, ...) where episodes began that crashed, copies included; None without any
+    rates: list[float]  # rates of reaching each level from the one before; the last, of a crash
+    steps: int  # number of simulated steps
+    starts: Any  # (k, ...) starts of the paths that crashed, copies included; None without any
 
 
 def splitting(
@@ -149,15 +178,17 @@ def splitting(
     """Estimates the probability that an episode crashes.
 
     Args:
-        key: of everything random in it.
+        key: random key for the whole estimate.
         pmdp: the environment, the threats and the threshold.
-        values: scores the actions.
-        levels: of the least threat, ascending, chosen without looking at this run's numbers.
-        particles: paths per stage.
-        stage: `advance`, compiled for `values` (see `compiled`).
+        values: scores the actions; the best admissible one is taken.
+        levels: ascending levels of the least threat of any action, chosen without using numbers of
+            this run (see `choose_levels`).
+        particles: number of paths in each stage.
+        stage: `advance`, compiled for these values by `compiled`; compiled anew by default.
 
     Raises:
         ValueError: the levels do not ascend.
+        FloatingPointError: an observation or a threat is not a finite number.
     """
     if any(b <= a for a, b in itertools.pairwise(levels)):
         raise ValueError(f"levels is {list(levels)}; they must ascend")
@@ -183,9 +214,14 @@ _resample = jax.jit(resample)
 
 
 def compiled(values: Values) -> Callable[..., Paths]:
-    """(key, paths, pmdp, level) -> Paths: `advance`, compiled once for a policy.
+    """Returns `advance`, compiled once for a policy.
 
-    It raises FloatingPointError if a path saw what is not a finite number.
+    Args:
+        values: scores the actions; the best admissible one is taken.
+
+    Returns:
+        A function (key, paths, pmdp, level) -> paths. It raises FloatingPointError if an
+        observation or a threat of a path is not a finite number.
     """
     stage = jax.jit(lambda key, paths, pmdp, level: advance(key, paths, pmdp, values, level))
 
@@ -206,12 +242,18 @@ def choose_levels(
     particles: int,
     stage: Callable[..., Paths],
 ) -> tuple[list[float], int]:
-    """Levels that about a fifth of the paths reach from one to the next, found by a pilot run.
+    """Finds levels so that about a fifth of the paths gets from each to the next, by a pilot run.
 
-    Use them with other keys: an estimate whose levels come from its own paths is biased.
+    Use them with another key: an estimate is biased if its levels come from its own paths.
+
+    Args:
+        key: random key for the pilot run.
+        pmdp: the environment, the threats and the threshold.
+        particles: number of paths in each stage.
+        stage: `advance`, compiled for a policy by `compiled`.
 
     Returns:
-        (levels, steps simulated).
+        The ascending levels, and the number of simulated steps.
     """
     levels: list[float] = []
     steps = 0

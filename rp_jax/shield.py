@@ -1,6 +1,11 @@
 """The admissible set of the P-MDP and the choices inside it (Definitions 1 and 3).
 
-Primitives are unbatched: threats and values are (A,), masks (A,) bool.
+The threat T(s, a) is the expected danger of taking action a in state s and following the baseline
+policy eta afterwards. An action is admissible if its threat is at most the threshold x. A state
+with such an action is called secure; in an insecure one only the least threatening action, that of
+the policy "greedy-eta", is admissible.
+
+All functions are unbatched: threats and values are (A,), masks (A,) bool, for A actions.
 """
 
 from typing import Any, NamedTuple
@@ -12,24 +17,29 @@ from jax import Array
 
 from rp_jax.validate import leading, number, random_key, ranked
 
-WORD = 32  # actions to a word of a stored mask
-
 
 class Shield(NamedTuple):
-    """What a state allows."""
+    """The actions that a state allows."""
 
     admissible: Array  # (A,) bool, never empty
-    secure: Array  # () bool, s is in S^{eta,x}: some action's threat is at most x
+    secure: Array  # () bool, some action's threat is at most x: the state is in S^{eta,x}
 
 
 def shield(threat: Array, x: Array | float) -> Shield:
-    """A^{eta,x}(s) = {a : T(s, a) <= x}; where that is empty, greedy-eta alone (equation 8).
+    """Returns the admissible set A^{eta,x}(s) = {a : T(s, a) <= x} of a state.
 
-    A threat that is nan is never admissible; if all are nan, action 0 remains.
+    Where that set is empty, the least threatening action alone is admissible (equation 8). A threat
+    that is nan is never admissible; if all are nan, action 0 is.
 
     Args:
-        threat: (A,) action threats T(s, .).
-        x: threshold; infinity switches the shield off.
+        threat: (A,) threats T(s, .) of the actions.
+        x: () threshold; infinity switches the shield off.
+
+    Returns:
+        The set as a mask (A,), and whether the state is secure, ().
+
+    Raises:
+        ValueError: an argument is not a number, or has another number of axes.
     """
     ranked(1, threat=threat)
     ranked(0, x=x) if hasattr(x, "shape") else number("x", x, infinite=True)
@@ -40,71 +50,96 @@ def shield(threat: Array, x: Array | float) -> Shield:
 
 
 def rounded_down(x: Any) -> np.ndarray:
-    """Thresholds, float64 of any shape, as float32 that are nowhere greater.
+    """Returns thresholds as float32 numbers that are nowhere greater.
 
-    So no action is admissible in float32 that is not in float64: T <= x holds wherever it holds
-    for the rounded x and for T, `rounded_up`.
+    With threats passed through `rounded_up`, an action that is admissible in float32 is admissible
+    in float64 as well.
+
+    Args:
+        x: thresholds in float64, of any shape.
     """
     return -rounded_up(-np.asarray(x, np.float64))
 
 
 def rounded_up(threat: Any) -> np.ndarray:
-    """Threats, float64 of any shape, as float32 that are nowhere less."""
+    """Returns threats as float32 numbers that are nowhere less.
+
+    Args:
+        threat: threats in float64, of any shape; those beyond the largest float32 become infinity.
+    """
     threat = np.asarray(threat, np.float64)
-    with np.errstate(over="ignore"):  # infinity is what is above the largest number
+    with np.errstate(over="ignore"):  # beyond the largest float32 comes infinity
         above = threat.astype(np.float32)
     above = np.where(above < threat, np.nextafter(above, np.float32(np.inf)), above)
-    # The smallest numbers are flushed to 0 by compiled code.
+    # Compiled code would flush subnormal numbers to 0.
     tiny = np.finfo(np.float32).tiny
     return np.where((above > 0) & (above < tiny), tiny, above)
 
 
 def greedy_eta(threat: Array) -> Array:
-    """() int, the least threatening action; nan counts as the worst."""
+    """Returns the least threatening action.
+
+    Args:
+        threat: (A,) threats of the actions; nan counts as the worst.
+
+    Returns:
+        () int, the action's index.
+    """
     return jnp.argmin(jnp.where(jnp.isnan(threat), jnp.inf, threat))
 
 
 def masked_argmax(values: Array, admissible: Array) -> Array:
-    """() int, the admissible action of the greatest value (Algorithm 4, line 6)."""
+    """Returns the admissible action of the greatest value (Algorithm 4, line 6).
+
+    Args:
+        values: (A,) values of the actions.
+        admissible: (A,) bool.
+
+    Returns:
+        () int, the action's index.
+
+    Raises:
+        ValueError: the arguments are not two arrays of one length.
+    """
     ranked(1, values=values, admissible=admissible)
     leading(admissible=admissible, values=values)
     return jnp.argmax(jnp.where(admissible, values, -jnp.inf))
 
 
 class Correction(NamedTuple):
-    """What a shield makes of a policy's wish."""
+    """A policy's proposal after the shield has looked at it."""
 
-    action: Array  # () int, an admissible one
-    intervened: Array  # () bool, it is not the one wished for
+    action: Array  # () int, the admissible action to take
+    intervened: Array  # () bool, it is not the proposed one
     secure: Array  # () bool, some action's threat is at most x
 
 
 def correct(
     threat: Array, action: Array, x: Array | float, table: Array | None = None
 ) -> Correction:
-    """The admissible action that comes closest to a policy's wish.
+    """Returns the admissible action that comes closest to a policy's proposal.
 
     Args:
-        threat: (A,) action threats T(s, .).
-        action: the wish. () int: one action; if it is not admissible, the least threatening one is
-            taken. (A,) float: scores of all actions; the best admissible one is taken. With a
-            table, (D,) float: the nearest admissible row is taken.
-        x: threshold; infinity lets every wish pass.
-        table: (A, D) the actions that the threats are of.
+        threat: (A,) threats T(s, .) of the actions.
+        action: the proposal. () int: one action; if it is not admissible, the least threatening one
+            is taken. (A,) float: scores of all actions; the best admissible one is taken. With a
+            table, (D,) float: a continuous action; the nearest admissible row is taken.
+        x: () threshold; infinity lets every proposal pass.
+        table: (A, D) the continuous actions that the threats belong to.
 
     Raises:
-        ValueError: the wish has a shape or type of none of these.
+        ValueError: the proposal has none of these shapes and types.
     """
     mask, secure = shield(threat, x)
     scores = _preference(threat, action, table)
-    # Finite, so that masked_argmax tells the worst admissible one from those not admissible.
+    # Finite scores, so that masked_argmax ranks every admissible action above the inadmissible.
     scores = jnp.nan_to_num(scores, nan=jnp.finfo(scores.dtype).min)
     taken = masked_argmax(scores, mask)
     return Correction(taken, taken != jnp.argmax(scores), secure)
 
 
 def _preference(threat: Array, action: Array, table: Array | None) -> Array:
-    """(A,) the higher, the more a wish allows for it."""
+    """Returns scores (A,), the higher, the closer an action comes to the proposal."""
     ranked(np.ndim(action), action=action)
     real = jnp.issubdtype(action.dtype, jnp.floating)
     if table is not None:
@@ -125,30 +160,21 @@ def _preference(threat: Array, action: Array, table: Array | None) -> Array:
 
 
 def masked_sample(key: Array, admissible: Array) -> Array:
-    """() int, uniform over the admissible actions."""
+    """Draws one of the admissible actions, all equally likely.
+
+    Args:
+        key: random key.
+        admissible: (A,) bool.
+
+    Returns:
+        () int, the action's index.
+
+    Raises:
+        ValueError: the key is not a single typed key, or the mask has another number of axes.
+    """
     random_key("key", key)
     ranked(1, admissible=admissible)
     rank = jnp.cumsum(admissible)
     uniform = jax.random.uniform(key)
     chosen = jnp.minimum(jnp.floor(uniform * rank[-1]), rank[-1] - 1)
     return jnp.argmax(rank > chosen)
-
-
-def to_bits(admissible: Array) -> Array:
-    """(W,) uint32, the mask (A,) as words of 32 actions, for storage."""
-    ranked(1, admissible=admissible)
-    parts = jnp.split(admissible, list(range(WORD, len(admissible), WORD)))
-    bits = [part.astype(jnp.uint32) << _places(len(part)) for part in parts]
-    return jnp.stack([jnp.sum(word, dtype=jnp.uint32) for word in bits])
-
-
-def from_bits(bits: Array, num_actions: int) -> Array:
-    """(A,) bool, the inverse of `to_bits`."""
-    ranked(1, bits=bits)
-    number("num_actions", num_actions, least=1, most=WORD * len(bits), integer=True)
-    each = (bits[:, None] >> _places(WORD)[None]) & 1
-    return each.astype(bool).reshape(-1)[:num_actions]
-
-
-def _places(count: int) -> Array:
-    return jnp.arange(count, dtype=jnp.uint32)

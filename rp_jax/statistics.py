@@ -1,4 +1,4 @@
-"""Honest statistics: intervals for rates and means, over episodes and over seeds."""
+"""Confidence intervals for rates and means, over episodes and over seeds."""
 
 import numpy as np
 from scipy import stats
@@ -7,10 +7,18 @@ from rp_jax.validate import MOST, number
 
 
 def clopper_pearson(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Exact two-sided interval of a rate, k events of n.
+    """Returns the exact two-sided confidence interval of a rate (Clopper and Pearson 1934).
+
+    Args:
+        k: number of events.
+        n: number of trials.
+        confidence: probability with which the interval holds the true rate, in (0, 1).
+
+    Returns:
+        (lower, upper) end.
 
     Raises:
-        ValueError: not 0 <= k <= n, n < 1, or a confidence outside (0, 1).
+        ValueError: a number is out of range.
     """
     number("n", n, least=1, integer=True)
     number("k", k, least=0, most=n, integer=True)
@@ -22,7 +30,16 @@ def clopper_pearson(k: int, n: int, confidence: float = 0.95) -> tuple[float, fl
 
 
 def upper_bound(k: int, n: int, confidence: float = 0.95) -> float:
-    """Exact one-sided upper bound of a rate: what k events of n exclude."""
+    """Returns the exact one-sided upper confidence bound of a rate.
+
+    Args:
+        k: number of events.
+        n: number of trials.
+        confidence: probability with which the true rate is at most the bound, in (0, 1).
+
+    Raises:
+        ValueError: a number is out of range.
+    """
     number("n", n, least=1, integer=True)
     number("k", k, least=0, most=n, integer=True)
     _check_confidence(confidence)
@@ -30,16 +47,16 @@ def upper_bound(k: int, n: int, confidence: float = 0.95) -> float:
 
 
 def plan_test(c: float, confidence: float, expected: float, power: float) -> tuple[int, int]:
-    """The smallest number of trials that can show a rate to be at most c, and the events allowed.
+    """Returns the smallest test that can show a rate to be at most c.
 
     Args:
         c: the rate not to be exceeded.
-        confidence: of the one-sided exact bound that must not exceed c.
-        expected: a rate below c that shall pass.
-        power: with at least this probability.
+        confidence: level of the exact upper bound (`upper_bound`), which must not exceed c.
+        expected: a true rate below c at which the test should succeed.
+        power: probability of success that is wanted at the rate `expected`.
 
     Returns:
-        (n, k): k or fewer events in n trials show it.
+        (n, k): the test succeeds if n trials show k events or fewer.
 
     Raises:
         ValueError: a value is out of range, or more than `MOST` trials are needed.
@@ -57,20 +74,20 @@ def plan_test(c: float, confidence: float, expected: float, power: float) -> tup
     def power_of(k: int) -> float:
         return stats.binom.cdf(k, _trials(k, c, confidence), expected)
 
-    low, high = -1, 0  # low is too few events, high may be
+    low, high = -1, 0  # `low` events are too few; at the end `high` are enough
     while power_of(high) < power:
         low, high = high, 2 * high + 1
         number("expected: episodes needed", _trials(high, c, confidence), most=MOST)
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if power_of(middle) >= power else (middle, high)
-    # More events have more power, but for the last few, since trials come whole.
+    # The power grows with k except over the last few values, since n is a whole number.
     k = next(k for k in range(max(0, high - 10), high + 1) if power_of(k) >= power)
     return _trials(k, c, confidence), k
 
 
 def _trials(k: int, c: float, confidence: float) -> int:
-    """The fewest trials among which k events exclude a rate above c."""
+    """Returns the fewest trials among which k events exclude a rate above c."""
     low, high = k, k + 2
     while stats.binom.cdf(k, high, c) > 1 - confidence:
         low, high = high, 2 * high
@@ -84,7 +101,16 @@ def _trials(k: int, c: float, confidence: float) -> int:
 
 
 def events_allowed(n: int, rate: float, confidence: float = 0.95) -> int:
-    """The most events of n whose one-sided exact bound is at most `rate`; -1 if not even none."""
+    """Returns the most events in n trials for which `upper_bound` is at most a given rate.
+
+    Args:
+        n: number of trials.
+        rate: the rate that the bound must not exceed.
+        confidence: level of the bound, in (0, 1).
+
+    Returns:
+        The number of events; -1 if the bound of no event at all exceeds the rate.
+    """
     k = int(stats.binom.ppf(1 - confidence, n, rate)) + 1 if n else -1
     while k >= 0 and (k > n or upper_bound(k, n, confidence) > rate):
         k -= 1
@@ -92,7 +118,18 @@ def events_allowed(n: int, rate: float, confidence: float = 0.95) -> int:
 
 
 def mean_interval(values: np.ndarray, confidence: float = 0.95) -> tuple[float, float]:
-    """(mean, half-width) of Student's interval; the half-width is nan for one value."""
+    """Returns the mean of some values with Student's confidence interval.
+
+    Args:
+        values: (n,) independent values.
+        confidence: probability with which the interval holds the true mean, in (0, 1).
+
+    Returns:
+        (mean, half-width of the interval); the half-width is nan for a single value.
+
+    Raises:
+        ValueError: there is no value, or the confidence is out of range.
+    """
     _check_confidence(confidence)
     values = np.asarray(values, float)
     n = values.size
@@ -104,6 +141,7 @@ def mean_interval(values: np.ndarray, confidence: float = 0.95) -> tuple[float, 
 
 
 def _check_confidence(confidence: float) -> None:
+    """Raises ValueError unless a confidence lies in (0, 1)."""
     number("confidence", confidence, above=0)
     if confidence >= 1:
         raise ValueError(f"confidence is {confidence!r}; it must be below 1")

@@ -1,7 +1,7 @@
-"""Files that are whole or absent: atomic writes, and arrays with a manifest of checksums."""
+"""Files that are either complete or absent: atomic writes, and arrays with checksums."""
 
 import contextlib
-import fcntl
+import dataclasses
 import hashlib
 import json
 import math
@@ -15,24 +15,36 @@ from typing import Any
 import jax
 import numpy as np
 
-FORMAT = 2  # of the manifest
-PART = ".part"  # ends the names of files that are being written
+try:
+    import fcntl
+except ImportError:  # not on this system: folders are then not locked
+    fcntl = None  # type: ignore[assignment]
+
+FORMAT = 2  # version of the manifest's layout
+PART = ".part"  # suffix of files that are still being written
 
 
 class StorageError(ValueError):
-    """A file is damaged, of another kind, or cannot be written."""
+    """A file is damaged, is of another kind, or cannot be written."""
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Writes a file through a temporary one, so that it is never half there.
+    """Writes a file so that it is either there completely or not at all.
+
+    The data goes to a temporary file first, which then takes the place of `path`.
+
+    Args:
+        path: the file; its folder must exist.
+        data: the file's content.
 
     Raises:
-        StorageError: it cannot be written; what was there before is still there.
+        StorageError: the file cannot be written; an earlier file of this name is left unchanged.
     """
     _write(Path(path), [memoryview(data)])
 
 
 def _write(path: Path, parts: Iterable[memoryview]) -> None:
+    """Writes parts one after another into one file, atomically; see `write_bytes`."""
     name = None
     try:
         handle, name = tempfile.mkstemp(PART, f".{path.name}.", path.parent)
@@ -54,14 +66,18 @@ def _write(path: Path, parts: Iterable[memoryview]) -> None:
 
 
 def sweep(folder: Path) -> None:
-    """Removes what writes left that ended with their process; no other may be at work in it."""
+    """Removes the temporary files of writes that were interrupted.
+
+    Args:
+        folder: searched with all its subfolders; no other process may be writing there.
+    """
     for left in Path(folder).rglob(f".*{PART}"):
         with contextlib.suppress(OSError):
             left.unlink()
 
 
 def _sync(folder: Path) -> None:
-    """Names in a folder outlive a loss of power only after this."""
+    """Makes the names in a folder survive a loss of power."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -70,18 +86,35 @@ def _sync(folder: Path) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes readable JSON, atomically. Nan and infinity become null and "inf"."""
-    text = json.dumps(_plain(value), indent=2, allow_nan=False)
+    """Writes readable JSON, atomically.
+
+    Args:
+        path: the file; its folder must exist.
+        value: what JSON can hold, and arrays and paths. Nan becomes null; infinity becomes "inf".
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    text = json.dumps(plain(value), indent=2, allow_nan=False)
     write_bytes(path, (text + "\n").encode())
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Returns a value converted to what JSON can represent.
+
+    Args:
+        value: mappings, sequences, dataclasses, arrays, paths, numbers and strings, nested.
+            Dataclasses become mappings, arrays lists, paths strings, nan None, and infinity "inf"
+            or "-inf".
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = dataclasses.asdict(value)
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, np.ndarray | np.generic | jax.Array):
-        return _plain(np.asarray(value).tolist())
+        return plain(np.asarray(value).tolist())
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, float) and not np.isfinite(value):
@@ -90,10 +123,16 @@ def _plain(value: Any) -> Any:
 
 
 def new_folder(path: Path) -> Path:
-    """Creates a folder for results.
+    """Creates a folder for results; one that exists must be empty.
+
+    Args:
+        path: the folder; missing parents are created.
+
+    Returns:
+        The folder's path.
 
     Raises:
-        StorageError: it exists and holds something, or cannot be created or written.
+        StorageError: the folder holds something, or cannot be created or written to.
     """
     path = Path(path)
     try:
@@ -113,16 +152,20 @@ def new_folder(path: Path) -> Path:
 
 @contextlib.contextmanager
 def locked(folder: Path, name: str) -> Iterator[int]:
-    """Keeps other processes from entering a folder; ends with the process, however that ends.
+    """Keeps other processes from working in a folder while the context lasts.
 
-    Yields the lock's descriptor: a process that is given it holds the lock too.
+    The lock ends with the process, however that ends.
 
     Args:
-        folder: named in messages.
-        name: of the lock, a file in it.
+        folder: the folder; messages name it.
+        name: name of the lock, a file in the folder.
+
+    Yields:
+        The lock's file descriptor; a child process that inherits it holds the lock too.
 
     Raises:
-        StorageError: another process is inside, or has left and removed the lock.
+        StorageError: another process is at work in the folder, or has just finished and removed
+            the lock.
     """
     path = Path(folder) / name
     try:
@@ -131,7 +174,8 @@ def locked(folder: Path, name: str) -> Iterator[int]:
         raise StorageError(f"{path}: cannot be written ({error.strerror})") from error
     with file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise StorageError(f"{folder}: another process is at work in this folder") from None
         except OSError:
@@ -142,25 +186,52 @@ def locked(folder: Path, name: str) -> Iterator[int]:
 
 
 def leaves(tree: Any) -> dict[str, np.ndarray]:
-    """A pytree's arrays by their paths; of random keys, their data."""
+    """Returns the arrays of a pytree by their paths.
+
+    Args:
+        tree: any pytree of arrays and random keys; a key is represented by its data.
+    """
     return {name: np.asarray(a, order="C") for name, a in _flat(jax.tree.map(_data, tree)).items()}
 
 
+def statics(part: Any, path: str = "") -> dict[str, Any]:
+    """Returns the fields of a tree of dataclasses that hold no arrays, by path.
+
+    Args:
+        part: a tree of flax's dataclasses, such as the parameters of an environment.
+        path: prefix of the paths.
+    """
+    found: dict[str, Any] = {}
+    if isinstance(part, Mapping):
+        for name, value in part.items():
+            found |= statics(value, f"{path}{name}/")
+    for field in dataclasses.fields(part) if dataclasses.is_dataclass(part) else ():
+        value, name = getattr(part, field.name), path + field.name
+        if field.metadata.get("pytree_node", True):
+            found |= statics(value, f"{name}/")
+        else:
+            found[name] = value
+    return found
+
+
 def _flat(tree: Any) -> dict[str, Any]:
+    """Returns the leaves of a pytree by their paths, such as "params/dense/kernel"."""
     flat, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): a for path, a in flat}
 
 
 def _is_key(a: Any) -> bool:
+    """Returns whether a leaf is a typed random key."""
     return hasattr(a, "dtype") and jax.dtypes.issubdtype(a.dtype, jax.dtypes.prng_key)
 
 
 def _data(a: Any) -> Any:
+    """Returns a random key's data, and any other leaf unchanged."""
     return jax.random.key_data(a) if _is_key(a) else a
 
 
 def _facts(array: Any) -> dict[str, Any]:
-    """Shape and type, of an array or of what stands for one."""
+    """Returns shape and type of an array, or of a stand-in such as `jax.ShapeDtypeStruct`."""
     if _is_key(array):
         array = jax.eval_shape(jax.random.key_data, array)
     if not hasattr(array, "dtype"):
@@ -169,33 +240,43 @@ def _facts(array: Any) -> dict[str, Any]:
 
 
 def _size(facts: Mapping[str, Any]) -> int:
+    """Returns the number of bytes of an array with this shape and type."""
     return math.prod(facts["shape"]) * jax.numpy.dtype(facts["dtype"]).itemsize
 
 
 def _arrays_file(folder: Path, sha256: str) -> Path:
+    """Returns the file that holds the arrays with this checksum."""
     return folder / f"arrays-{sha256[:16]}.bin"
 
 
 def seal(manifest: Mapping[str, Any]) -> str:
-    """The checksum of a manifest itself."""
+    """Returns the checksum of a manifest.
+
+    Args:
+        manifest: its fields; one named "seal" is left out.
+
+    Returns:
+        SHA-256 as 64 hexadecimal digits.
+    """
     rest = {key: value for key, value in manifest.items() if key != "seal"}
     return hashlib.sha256(json.dumps(rest).encode()).hexdigest()
 
 
 def save(folder: Path, kind: str, tree: Any, about: Mapping[str, Any]) -> None:
-    """Saves a pytree's arrays, and `manifest.json` with what is needed to read and check them.
+    """Saves the arrays of a pytree, with a manifest from which they can be read and checked.
 
-    The arrays lie one after another, in C order, in a file named after its checksum. The manifest
-    is written last: until then, what was saved in the folder before is whole and is what counts.
+    The arrays lie one after another, in C order, in a file named after its checksum. The file
+    `manifest.json` is written last: until then, whatever was saved in the folder before stays
+    complete and valid.
 
     Args:
-        folder: created if missing.
-        kind: what this is, asked for again by `load`.
+        folder: created if it is missing.
+        kind: name for the kind of content; `load` asks for it again.
         tree: any pytree of arrays and random keys.
-        about: JSON-like facts about it.
+        about: facts about the content, which `plain` must be able to convert.
 
     Raises:
-        StorageError: it cannot be written.
+        StorageError: the folder or a file cannot be written.
     """
     folder = Path(folder)
     try:
@@ -208,7 +289,7 @@ def save(folder: Path, kind: str, tree: Any, about: Mapping[str, Any]) -> None:
     digest = hashlib.sha256()
     for part in raw:
         digest.update(part)
-    manifest = _plain(
+    manifest = plain(
         {
             "format": FORMAT,
             "kind": kind,
@@ -229,10 +310,18 @@ def save(folder: Path, kind: str, tree: Any, about: Mapping[str, Any]) -> None:
 
 
 def read_manifest(folder: Path, kind: str) -> dict[str, Any]:
-    """The manifest of what `save` wrote.
+    """Returns the manifest that `save` wrote, checked.
+
+    Args:
+        folder: the folder given to `save`.
+        kind: the kind given to `save`.
+
+    Returns:
+        Its fields: `about` (what `save` was given), `arrays` (shapes and types by path), and
+        checksums.
 
     Raises:
-        StorageError: it is missing, unreadable, damaged, or of another kind.
+        StorageError: the manifest is missing, unreadable, damaged, or of another kind.
     """
     path = Path(folder) / "manifest.json"
     try:
@@ -257,19 +346,20 @@ def read_manifest(folder: Path, kind: str) -> dict[str, Any]:
 
 
 def load(folder: Path, kind: str, like: Any) -> Any:
-    """The pytree that `save` wrote, in the structure of `like`.
+    """Returns the pytree that `save` wrote, in the structure of `like`.
 
-    Every array must have the shape and type of its counterpart in `like`, and the file the
-    checksum in the manifest. Nothing is allocated for sizes that only the file claims.
+    Every array must have the shape and type of its counterpart in `like`, and the file must have
+    the checksum that the manifest states. No memory is allocated for sizes that only the file
+    claims.
 
     Args:
-        folder: given to `save`.
-        kind: given to `save`.
-        like: arrays and keys; for arrays, `jax.ShapeDtypeStruct`s will do. Where it has numpy's
-            arrays, so has the result.
+        folder: the folder given to `save`.
+        kind: the kind given to `save`.
+        like: pytree of arrays and random keys; `jax.ShapeDtypeStruct` may stand for an array. Where
+            it has a numpy array, so has the result.
 
     Raises:
-        StorageError: anything is missing, damaged, or of another shape.
+        StorageError: something is missing, damaged, or of another shape.
     """
     folder = Path(folder)
     manifest = read_manifest(folder, kind)
@@ -293,14 +383,50 @@ def load(folder: Path, kind: str, like: Any) -> Any:
     return jax.tree.unflatten(jax.tree.structure(like), [found[name] for name in expected])
 
 
+def load_some(folder: Path, kind: str, like: Mapping[str, Any]) -> dict[str, Any]:
+    """Loads some of the arrays that `save` wrote, by their paths.
+
+    Args:
+        folder: the folder given to `save`.
+        kind: the kind given to `save`.
+        like: by path, arrays or `jax.ShapeDtypeStruct` of the wanted shapes and types.
+
+    Returns:
+        The arrays by path.
+
+    Raises:
+        StorageError: something is missing, damaged, or of another shape.
+    """
+    folder = Path(folder)
+    manifest = read_manifest(folder, kind)
+    path, facts = folder / "manifest.json", manifest["arrays"]
+    for name, wanted in like.items():
+        if facts.get(name) != _facts(wanted):
+            raise StorageError(
+                f"{path}: {name} is {_named(facts.get(name))}; it must be {_named(_facts(wanted))}"
+            )
+    try:
+        data = _read_arrays(folder, manifest, sum(map(_size, facts.values())))
+    except (TypeError, KeyError, ValueError) as error:
+        raise StorageError(f"{path}: arrays cannot be read ({error})") from error
+    found, start = {}, 0
+    for name, about in facts.items():
+        end = start + _size(about)
+        if name in like:
+            found[name] = _restored(data[start:end], about, like[name])
+        start = end
+    return found
+
+
 def _named(facts: Any) -> str:
+    """Returns how a message shows an array's shape and type."""
     if isinstance(facts, dict):
         return f"{facts.get('dtype')}{facts.get('shape')}"
     return repr(facts)
 
 
 def _read_arrays(folder: Path, manifest: Mapping[str, Any], size: int) -> memoryview:
-    """The bytes of all arrays, checked."""
+    """Returns the bytes of all arrays, after checking their number and checksum."""
     sha256 = str(manifest.get("sha256"))
     if manifest.get("bytes") != size or not re.fullmatch("[0-9a-f]{64}", sha256):
         raise StorageError(f"{folder / 'manifest.json'}: 'bytes' or 'sha256' cannot be right")
@@ -318,6 +444,7 @@ def _read_arrays(folder: Path, manifest: Mapping[str, Any], size: int) -> memory
 
 
 def _restored(data: memoryview, facts: Mapping[str, Any], like: Any) -> Any:
+    """Returns one array from its bytes: a key, a numpy array or a JAX array, as `like` is."""
     dtype = jax.numpy.dtype(facts["dtype"])
     array = np.frombuffer(data, dtype).reshape(facts["shape"]).copy()
     if isinstance(like, np.ndarray):

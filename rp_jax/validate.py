@@ -1,4 +1,4 @@
-"""Checks of user input: every message names the field, the value and what is allowed."""
+"""Checks of user input: every message names the field, its value and what is allowed."""
 
 import contextlib
 import math
@@ -10,16 +10,28 @@ import numpy as np
 
 T = TypeVar("T")
 
-MOST = 2_000_000_000  # of anything that is counted: it has to fit into an int32
+MOST = 2_000_000_000  # the largest allowed count of anything: it has to fit into an int32
 
 
 def _finite(value: float) -> bool:
-    """Whether it is a finite number, in single precision too."""
+    """Returns whether a number is finite, in single precision too."""
     return abs(value) <= float(np.finfo(np.float32).max)  # false for nan
 
 
 def one_of(field: str, value: T, allowed: Iterable[T]) -> T:
-    """Returns `value` if it is one of `allowed`, else raises ValueError."""
+    """Returns a value that is one of the allowed ones, and raises ValueError otherwise.
+
+    Args:
+        field: name of the value, for the message.
+        value: what the user gave.
+        allowed: the choices; the value must equal one of them and have its type.
+
+    Returns:
+        The value, unchanged.
+
+    Raises:
+        ValueError: the value is none of the choices.
+    """
     choices = list(allowed)
     if not any(isinstance(value, type(choice)) and value == choice for choice in choices):
         listed = ", ".join(map(repr, choices))
@@ -29,7 +41,14 @@ def one_of(field: str, value: T, allowed: Iterable[T]) -> T:
 
 @contextlib.contextmanager
 def within(option: str) -> Iterator[None]:
-    """A ValueError raised inside begins with the name of the option that a user knows."""
+    """Puts an option's name in front of the message of a ValueError raised inside the context.
+
+    Args:
+        option: the name by which the user knows what was wrong.
+
+    Raises:
+        ValueError: the one raised inside, with its new message.
+    """
     try:
         yield
     except ValueError as error:
@@ -46,16 +65,23 @@ def number(
     integer: bool = False,
     infinite: bool = False,
 ) -> float:
-    """Returns `value` if it is a number in the range, else raises ValueError.
+    """Returns a value that is a number in a range, and raises ValueError otherwise.
 
     Args:
-        field: name in the message.
+        field: name of the value, for the message.
         value: what the user gave.
         least: smallest allowed value, inclusive.
-        most: largest allowed value, inclusive; for whole numbers MOST if not given.
-        above: bound that must be exceeded.
+        most: largest allowed value, inclusive; `MOST` by default for whole numbers.
+        above: bound that the value must exceed.
         integer: whether only whole numbers are allowed.
-        infinite: whether infinity is allowed. Nan never is, nor what is too large for a float32.
+        infinite: whether infinity is allowed. Nan never is, nor is a finite number that is too
+            large for a float32.
+
+    Returns:
+        The value, unchanged.
+
+    Raises:
+        ValueError: the value is not a number, or is out of range.
     """
     if integer and most is None:
         most = MOST
@@ -79,12 +105,29 @@ def number(
 def positive(
     field: str, value: float, *, most: float | None = None, integer: bool = False
 ) -> float:
-    """Returns `value` if it is a number above 0 (and at most `most`), else raises ValueError."""
+    """Returns a value that is a number above 0, and raises ValueError otherwise.
+
+    Args:
+        field: name of the value, for the message.
+        value: what the user gave.
+        most: largest allowed value, inclusive.
+        integer: whether only whole numbers are allowed.
+
+    Returns:
+        The value, unchanged.
+
+    Raises:
+        ValueError: the value is not a number, or is out of range.
+    """
     return number(field, value, above=0, most=most, integer=integer)
 
 
 def shown(value: Any) -> str:
-    """What a message says of a value: itself, or its shape and type where it is an array."""
+    """Returns how a message shows a value: its text, or an array's type and shape.
+
+    Args:
+        value: anything; texts of more than 200 characters are cut.
+    """
     if isinstance(value, jax.Array | np.ndarray) and value.ndim:
         return f"{value.dtype}{list(value.shape)}"
     text = repr(value)
@@ -92,11 +135,20 @@ def shown(value: Any) -> str:
 
 
 def _numeric(dtype: Any) -> bool:
+    """Returns whether arrays of this type hold numbers or booleans."""
     return any(jax.dtypes.issubdtype(dtype, kind) for kind in (np.number, np.bool_))
 
 
 def ranked(rank: int, **arrays: Any) -> None:
-    """Raises ValueError, naming it, if one of some arrays is not of numbers or has other axes."""
+    """Raises ValueError unless all given arrays are numeric and have `rank` axes.
+
+    Args:
+        rank: the number of axes that each array must have.
+        **arrays: the arrays by name; a message names the first one that is wrong.
+
+    Raises:
+        ValueError: an argument is not a numeric array, or has another number of axes.
+    """
     for field, array in arrays.items():
         good = isinstance(array, jax.Array | np.ndarray | np.generic) and array.ndim == rank
         if not good or not _numeric(array.dtype):
@@ -105,10 +157,17 @@ def ranked(rank: int, **arrays: Any) -> None:
 
 
 def leading(**trees: Any) -> int:
-    """The length of the leading axis that all arrays of some pytrees share, at least 1.
+    """Returns the length of the leading axis that all arrays of some pytrees share.
+
+    Args:
+        **trees: the pytrees by name.
+
+    Returns:
+        The length, at least 1.
 
     Raises:
-        ValueError: naming the pytree, if there is none or another.
+        ValueError: an array of a pytree has no leading axis, or one of another length; the message
+            names the pytree.
     """
     found = 0
     for field, tree in trees.items():
@@ -124,14 +183,30 @@ def leading(**trees: Any) -> int:
 
 
 def random_key(field: str, key: Any) -> None:
-    """Raises ValueError unless it is one key, made by `jax.random.key`."""
+    """Raises ValueError unless the value is a single key made by `jax.random.key`.
+
+    Args:
+        field: name of the value, for the message.
+        key: what the user gave.
+
+    Raises:
+        ValueError: the value is not a typed key, or is an array of several keys.
+    """
     typed = isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key)
     if not typed or key.shape != ():
         raise ValueError(f"{field} is {shown(key)}; it must be one key of jax.random.key")
 
 
 def finite(what: str, values: Any) -> None:
-    """Raises FloatingPointError if a number that was computed is nan or infinite."""
+    """Raises FloatingPointError if a computed array holds nan or infinity.
+
+    Args:
+        what: name of the numbers, for the message.
+        values: array of any shape.
+
+    Raises:
+        FloatingPointError: at least one number is not finite; the message says how many are not.
+    """
     wrong = int(np.size(values) - np.isfinite(values).sum())
     if wrong:
         raise FloatingPointError(
@@ -140,7 +215,16 @@ def finite(what: str, values: Any) -> None:
 
 
 def none_bad(what: str, counts: Any) -> None:
-    """Raises FloatingPointError if a field `bad_*` of a NamedTuple of counts is not all 0."""
+    """Raises FloatingPointError unless all fields of a NamedTuple that begin with `bad_` are 0.
+
+    Args:
+        what: name of the computation, for the message.
+        counts: NamedTuple whose fields named `bad_...` count steps with numbers that are nan or
+            infinite.
+
+    Raises:
+        FloatingPointError: a count is not 0; the message names its field.
+    """
     for field in counts._fields:
         count = int(np.sum(getattr(counts, field))) if field.startswith("bad_") else 0
         if count:

@@ -1,3 +1,4 @@
+import fcntl
 import gc
 import os
 import tempfile
@@ -67,8 +68,8 @@ def precision(request):
 
 def of_any_speeds(sub):
     """Only the ends of the speeds matter to a label: one compilation serves all vehicles."""
-    ends = sub.agent.speeds[np.asarray([0, -1])]
-    return sub.replace(agent=sub.agent.replace(speeds=ends))
+    ends = sub.body.speeds[np.asarray([0, -1])]
+    return sub.replace(body=sub.body.replace(speeds=ends))
 
 
 @pytest.fixture(scope="session")
@@ -98,3 +99,31 @@ def monte_carlo():
         return jax.lax.map(one, (jax.random.split(key, len(features)), features))
 
     return lambda key, features, sub: label(key, features, of_any_speeds(sub))
+
+
+def once(tmp_path_factory, name, *options):
+    """The folder of a whole run, made by one of pytest's processes for all of them."""
+    from tiny import go, moment
+
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "whole" / name
+    folder.parent.mkdir(exist_ok=True)
+    with folder.with_suffix(".lock").open("a+") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not lock.seek(0, os.SEEK_END):  # as it is now that the lock is held
+            with moment():
+                go(name, folder, *options)
+            lock.write("made")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory):
+    """A whole run of Circuit, two seeds, without figures."""
+    return once(tmp_path_factory, "circuit", "--no-figures --track circle --test-tracks circle")
+
+
+@pytest.fixture(scope="session")
+def drawn(tmp_path_factory):
+    """A whole run of Jam, with figures."""
+    return once(tmp_path_factory, "jam", "--obstacles 3 --test-obstacles 3")

@@ -1,6 +1,6 @@
 """Finite CMDPs as environments, so that learners can be held against exact answers.
 
-The module satisfies what learners use of `rp_jax.envs.base.Env`.
+The module satisfies what learners use of `rp_jax.envs.Env`.
 """
 
 import jax
@@ -9,7 +9,7 @@ import numpy as np
 from flax import struct
 from probe import make_pmdp
 
-from rp_jax.envs import base
+from rp_jax.envs import contract
 from rp_jax.tabular import cmdp
 from rp_jax.tabular.cmdp import FiniteCMDP
 
@@ -42,8 +42,8 @@ def step(key, state, action, params):
     index = jax.random.choice(key, len(model.start), p=model.transition[state.index, action])
     reached = State(index=index, time=state.time + 1)
     ended = reached.time >= model.horizon
-    terminated, truncated = base.ended(ended, reached.time, params.time_limit)
-    return reached, base.Outcome(
+    terminated, truncated = contract.ended(ended, reached.time, params.time_limit)
+    return reached, contract.Outcome(
         reward=model.reward[state.index, action],
         danger=model.danger[state.index, action],
         terminated=terminated,
@@ -58,7 +58,7 @@ def observe(state, params):
     return jax.nn.one_hot(state.time * states + state.index, horizon * states)
 
 
-def causes(state, params):
+def collisions(state, params):
     return {}
 
 

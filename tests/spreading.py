@@ -30,7 +30,7 @@ LOOP = loop.LoopConfig(steps=200, num_envs=8, batch=16, replay=256, replay_start
 def learner(mesh):
     """From seeds to weights after some learning, leading axis (seeds,)."""
     pmdp = probe.make_pmdp(probe, probe.make_params())
-    axes = (0, pmdp.replace(params=None, threats=None, x=0, penalty=None, toll=None))
+    axes = (0, pmdp.replace(params=None, threats=None, x=0, penalty=None, insecure_penalty=None))
 
     def learn(key, pmdp):
         return loop.chunk(loop.init(key, pmdp, LOOP)[0], pmdp, LOOP, 20)[0].learner.params

@@ -13,8 +13,9 @@ FOREIGN = ("brax", "matplotlib", "gymnasium")
 # From the left to the right, as data flow: each imports only from parts to its left, and parts of
 # one place in the line not from one another.
 ORDER = [
-    {"validate", "storage", "devices", "kinematics"},
-    {"sensing", "statistics", "shield", "checkpoints"},
+    {"validate", "storage", "devices", "arrays"},
+    {"dynamics"},
+    {"statistics", "shield", "checkpoints"},
     {"hazards"},
     {"envs"},
     {"recon"},

@@ -18,7 +18,7 @@ from quick import compile_soon  # noqa: F401
 
 from experiments import circuit as driving
 from experiments import jam as jamming
-from rp_jax import evaluate, shield
+from rp_jax import evaluation, shield
 from rp_jax.envs import circuit, jam, point_gather, tracks
 from rp_jax.envs.tracks import TrackPlan
 from rp_jax.planning import dqn, loop
@@ -93,7 +93,7 @@ def run_validated(module, changes):
 
 
 RUNS = st.sampled_from([driving, jamming])
-SHARED = "seeds seed x learning_penalty learning_toll penalty episodes devices fidelity baseline"
+SHARED = "seeds seed x learning_penalty insecure_penalty penalty episodes devices fidelity baseline"
 of_runs = st.dictionaries(st.sampled_from(SHARED.split()), junk, min_size=1, max_size=3)
 
 
@@ -215,10 +215,10 @@ KEY = jax.random.key(0)
 PARAMS = probe.make_params()
 PMDP = probe.make_pmdp(probe, PARAMS)
 SUB = probe.sub_rmdps(PARAMS)["pit"]
-AGENTS = jax.tree.map(lambda a: jnp.stack([a] * 4), probe.start_at(3).agent)
+BODIES = jax.tree.map(lambda a: jnp.stack([a] * 4), probe.start_at(3).body)
 HAZARDS = jnp.zeros((4, 2))
-FEW = jax.tree.map(lambda a: a[:3], AGENTS)
-NONE = jax.tree.map(lambda a: a[:0], AGENTS)
+FEW = jax.tree.map(lambda a: a[:3], BODIES)
+NONE = jax.tree.map(lambda a: a[:0], BODIES)
 DATA = fit.Dataset(jnp.ones((40, 3)), jnp.ones((40, 3)))
 NO_KEYS = [None, 0, "key", jax.random.split(KEY, 2), jax.random.key_data(KEY), np.zeros(2)]
 NO_COUNTS = [0, -3, 2.0, 10**12, True, None, "7", float("nan"), np.ones(2), 3 + 0j]
@@ -230,12 +230,12 @@ def zeros(percept):
     return jnp.zeros(percept.admissible.shape)
 
 
-def label(key=KEY, agent=AGENTS, hazard=HAZARDS, **sizes):
-    return labels.label(key, agent, hazard, SUB, labels.exact_threat, **sizes)
+def label(key=KEY, body=BODIES, hazard=HAZARDS, **sizes):
+    return labels.label(key, body, hazard, SUB, labels.exact_threat, **sizes)
 
 
 def play(key=KEY, values=zeros, episodes=8, **sizes):
-    return evaluate.run_episodes(key, PMDP, values, episodes, **sizes)
+    return evaluation.run_episodes(key, PMDP, values, episodes, **sizes)
 
 
 def learn(key=KEY, **changes):
@@ -253,7 +253,7 @@ def built(key=KEY, x=0.5, **changes):
 WRONG = {
     label: {
         "key": NO_KEYS,
-        "agent": [None, NONE, (), jnp.zeros(())],
+        "body": [None, NONE, (), jnp.zeros(())],
         "hazard": [None, HAZARDS[:3], HAZARDS[:0], jnp.zeros(()), 7],
         "batch": NO_COUNTS,
         "rows": NO_COUNTS,
@@ -277,8 +277,6 @@ WRONG = {
     shield.correct: {"action": [None, 1.5, "a", jnp.zeros(2), jnp.zeros((3, 3)), THREE > 0]},
     shield.masked_argmax: {"values": [*NO_ROWS, jnp.zeros(2)], "admissible": NO_ROWS},
     shield.masked_sample: {"key": NO_KEYS, "admissible": NO_ROWS},
-    shield.to_bits: {"admissible": NO_ROWS},
-    shield.from_bits: {"bits": NO_ROWS, "num_actions": [*NO_COUNTS, 33]},
 }
 GOOD = {
     labels.best_estimator: {"sub": SUB, "paths": 8},
@@ -286,10 +284,8 @@ GOOD = {
     shield.correct: {"threat": THREE, "action": jnp.asarray(1), "x": 0.5},
     shield.masked_argmax: {"values": THREE, "admissible": THREE < 0.5},
     shield.masked_sample: {"key": KEY, "admissible": THREE < 0.5},
-    shield.to_bits: {"admissible": THREE < 0.5},
-    shield.from_bits: {"bits": jnp.ones(1, jnp.uint32), "num_actions": 3},
 }
-NAMES = {"data": ("features", "threat"), "agent": ("agent", "hazard")}
+NAMES = {"data": ("features", "threat"), "body": ("body", "hazard")}
 
 
 @pytest.mark.parametrize(

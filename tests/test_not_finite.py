@@ -12,7 +12,7 @@ import pytest
 from quick import compile_soon  # noqa: F401
 
 from experiments import policy_gradient, tasks
-from rp_jax import evaluate, rare, shield
+from rp_jax import evaluation, rare, shield
 from rp_jax.baselines import actor_critic
 from rp_jax.baselines.actor_critic import ActorCriticConfig
 from rp_jax.baselines.cpo import CPOConfig
@@ -20,7 +20,8 @@ from rp_jax.baselines.pid_lagrangian import PIDConfig
 from rp_jax.checkpoints import NO_CHECKPOINTS
 from rp_jax.planning import dqn, loop
 from rp_jax.planning.loop import LoopConfig
-from rp_jax.planning.pmdp import PMDP, encode
+from rp_jax.planning.percept import encode
+from rp_jax.planning.pmdp import PMDP
 from rp_jax.recon import labels
 from rp_jax.threat import build
 from rp_jax.threat.fit import Dataset, FitConfig
@@ -79,8 +80,8 @@ def trained(pmdp, config=CONFIG):
 
 def played(pmdp):
     values = lambda percept: jnp.zeros(percept.threat.shape)  # noqa: E731
-    run = jax.jit(lambda key, pmdp: evaluate.run_episodes(key, pmdp, values, 8, batch=8))
-    evaluate.check(jax.tree.map(np.asarray, run(jax.random.key(0), pmdp)), "N=8")
+    run = jax.jit(lambda key, pmdp: evaluation.run_episodes(key, pmdp, values, 8, batch=8))
+    evaluation.check(jax.tree.map(np.asarray, run(jax.random.key(0), pmdp)), "N=8")
 
 
 def test_what_is_sound_passes():
@@ -110,7 +111,7 @@ class Threatened(PMDP):
 
     def threat(self, states, alive=None):
         there = (states.time == 2)[:, None] & (jnp.arange(3) == 1)
-        wrong = self.toll  # which serves for nothing else here
+        wrong = self.insecure_penalty  # which serves for nothing else here
         return jnp.where(there, wrong, jnp.zeros((states.time.shape[0], 3)))
 
 
@@ -118,7 +119,7 @@ class Threatened(PMDP):
 def test_threats_are_named(wrong):
     like = probe.make_pmdp(probe, PARAMS)
     fields = {name: getattr(like, name) for name in like.__dataclass_fields__}
-    pmdp = Threatened(**{**fields, "toll": jnp.float32(wrong)})
+    pmdp = Threatened(**{**fields, "insecure_penalty": jnp.float32(wrong)})
     with pytest.raises(FloatingPointError, match=r"^planning: threats of \d+ steps"):
         trained(pmdp)
     with pytest.raises(FloatingPointError, match=r"^N=8: threats of \d+ steps"):
@@ -221,15 +222,15 @@ def test_policy_gradients_name_observations_and_what_is_learned(name, tmp_path, 
 def test_labels_are_named(wrong):
     sub = probe.sub_rmdps(PARAMS)["pit"]
 
-    def estimator(key, agent, hazard, sub):
-        found = labels.exact_threat(key, agent, hazard, sub)
+    def estimator(key, body, hazard, sub):
+        found = labels.exact_threat(key, body, hazard, sub)
         return found.replace(threat=found.threat.at[1].set(wrong))
 
-    agent, hazard = jax.vmap(lambda key: sub.source.sample(key, sub.agent))(
+    body, hazard = jax.vmap(lambda key: sub.source.sample(key, sub.body))(
         jax.random.split(jax.random.key(0), 4)
     )
     with pytest.raises(FloatingPointError, match=r"^labels: 4 of 12 numbers are nan or infinite"):
-        labels.label(jax.random.key(0), agent, hazard, sub, estimator)
+        labels.label(jax.random.key(0), body, hazard, sub, estimator)
 
 
 def fitted(monkeypatch, change=None, wrong=0.5):

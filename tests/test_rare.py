@@ -18,7 +18,7 @@ class Graded(PMDP):
     """Threat grows towards the pit; nothing is forbidden."""
 
     def threat(self, states, alive=None):
-        cell = states.agent.position[:, 0] / 10
+        cell = states.body.position[:, 0] / 10
         return jnp.tile(cell[:, None], (1, 3))
 
 
@@ -100,7 +100,7 @@ def test_rates_multiply_and_starts_are_those_of_the_crashed():
     found = rare.splitting(jax.random.key(1), pmdp, rightwards, (0.35, 0.55), 200, stage=STAGE)
     assert len(found.rates) == 3
     assert found.estimate == pytest.approx(np.prod(found.rates))
-    cells = found.starts.agent.position[:, 0]
+    cells = found.starts.body.position[:, 0]
     assert len(cells) == round(200 * found.rates[-1])
     assert set(cells) <= set(map(float, probe.STARTS))
     assert (found.starts.time == 0).all()
@@ -111,7 +111,7 @@ def test_a_path_stops_where_it_reaches_the_level_and_no_later():
     paths = rare.begin(jax.random.key(2), pmdp, 100)
     stopped = STAGE(jax.random.key(3), paths, pmdp, jnp.asarray(0.45, jnp.float32))
     reached = np.asarray(stopped.reached)
-    cells = np.asarray(stopped.states.agent.position[:, 0])
+    cells = np.asarray(stopped.states.body.position[:, 0])
     assert reached.any()
     assert not reached.all()
     assert (cells[reached] == 5).all()
@@ -120,7 +120,7 @@ def test_a_path_stops_where_it_reaches_the_level_and_no_later():
     assert (time[reached] < LIMIT).all()
     assert not stopped.crashed.any()
     on = rare.resample(jax.random.key(4), stopped)
-    assert (np.asarray(on.states.agent.position[:, 0]) == 5).all()
+    assert (np.asarray(on.states.body.position[:, 0]) == 5).all()
 
 
 def test_levels_of_a_pilot_run_ascend_and_are_left_behind_by_a_share():

@@ -13,8 +13,8 @@ from benchmarks.measure import Row
 from benchmarks.peers import environments, numpy_jam
 from benchmarks.report import machine, short
 from benchmarks.setups import pmdp_of, quick_tasks
-from experiments import console
 from rp_jax import storage
+from rp_jax.cli import terminal
 from rp_jax.envs import jam
 
 
@@ -34,9 +34,9 @@ ENVIRONMENT, LOOP = "rp_jax Jam, observed", "rp_jax DQN"  # what others are comp
 
 def ours() -> list[Row]:
     """Steps of Jam, and of the training loop without and with the shield."""
-    task, config = quick_tasks()["jam"]
-    shielded = pmdp_of(task, config)
-    plain = shielded.replace(threats=None, x=jnp.asarray(jnp.inf))
+    world, config = quick_tasks()["jam"]
+    shielded = pmdp_of(world, config)
+    plain = shielded.replace(threats={}, shielded=False, x=jnp.asarray(jnp.inf))
     env = [
         replace(
             env_step.row("", jam, jam.make_params(), look, env_step.BATCH),
@@ -80,7 +80,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path("results/peers"), help="environments")
     parser.add_argument("--out", type=Path, help="folder for the JSON")
     given = parser.parse_args()
-    rows, skipped = others(given.cache, PEERS, console.say)
+    rows, skipped = others(given.cache, PEERS, terminal.say)
     found = compared([*ours(), *numpy_jam.run(), *rows])
     shown = [
         {
@@ -93,7 +93,7 @@ def main() -> None:
         }
         for row in found
     ]
-    console.table("peers", shown, list(shown[0]))
+    terminal.table("peers", shown, list(shown[0]))
     if given.out is not None:
         given.out.mkdir(parents=True, exist_ok=True)
         value = {"machine": machine(), "rows": found, "skipped": skipped}

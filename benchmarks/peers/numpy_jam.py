@@ -24,7 +24,7 @@ X, Y, ANGLE, SPEED = range(4)  # columns of a vehicle
 class State(NamedTuple):
     """Agent and obstacles."""
 
-    agent: np.ndarray  # (4,) x, y, heading in radians, speed
+    body: np.ndarray  # (4,) x, y, heading in radians, speed
     obstacles: np.ndarray  # (N, 4) likewise
     progress: float  # -20 x distance to the goal, rounded
     time: int
@@ -48,8 +48,8 @@ def _advanced(vehicle: np.ndarray, drive: np.ndarray, low: float, high: float) -
     return np.stack([*moved, *changed], axis=-1)
 
 
-def _progress(agent: np.ndarray) -> float:
-    return float(np.round(-20 * np.hypot(*(GOAL - agent[:2]))))
+def _progress(body: np.ndarray) -> float:
+    return float(np.round(-20 * np.hypot(*(GOAL - body[:2]))))
 
 
 def _gone(obstacles: np.ndarray) -> np.ndarray:
@@ -60,39 +60,39 @@ def _gone(obstacles: np.ndarray) -> np.ndarray:
     return outside | zones.any(axis=-1)
 
 
-def _appear(rng: np.random.Generator, agent: np.ndarray) -> np.ndarray:
+def _appear(rng: np.random.Generator, body: np.ndarray) -> np.ndarray:
     """(4,) an obstacle away from the agent."""
     while True:
         place = rng.uniform(RADIUS, jam.ROOM - RADIUS, 2)
-        if np.hypot(*(place - agent[:2])) >= jam.CLEARANCE:
+        if np.hypot(*(place - body[:2])) >= jam.CLEARANCE:
             heading, speed = rng.uniform(-np.pi, np.pi), rng.choice(jam.OBSTACLE_SPEEDS)
             return np.array([*place, heading, speed])
 
 
 def reset(rng: np.random.Generator, obstacles: int = 8) -> State:
     """The agent in its corner, the obstacles away from it."""
-    agent = np.array([0.2, 0.2, 0.0, 0.0])
-    others = np.stack([_appear(rng, agent) for _ in range(obstacles)])
-    return State(agent, others, _progress(agent), 0)
+    body = np.array([0.2, 0.2, 0.0, 0.0])
+    others = np.stack([_appear(rng, body) for _ in range(obstacles)])
+    return State(body, others, _progress(body), 0)
 
 
 def move(state: State, action: int, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Agent (4,), obstacles (N, 4) under accelerations and turns (N, 2), those out of place."""
     own = jam.ACCELERATIONS[action // len(jam.TURNS)], jam.TURNS[action % len(jam.TURNS)]
-    agent = _advanced(state.agent, np.array(own), jam.SPEEDS[0], jam.SPEEDS[-1])
+    body = _advanced(state.body, np.array(own), jam.SPEEDS[0], jam.SPEEDS[-1])
     ends = jam.OBSTACLE_SPEEDS[0], jam.OBSTACLE_SPEEDS[-1]
     obstacles = _advanced(state.obstacles, drive, *ends)
-    return agent, obstacles, _gone(obstacles)
+    return body, obstacles, _gone(obstacles)
 
 
-def finished(state: State, agent: np.ndarray, obstacles: np.ndarray) -> Step:
+def finished(state: State, body: np.ndarray, obstacles: np.ndarray) -> Step:
     """Reward and end of a step from `state` that led to these vehicles."""
-    walls = np.hypot(*(POINTS - agent[:2]).T) < RADIUS
-    others = np.hypot(*(obstacles[:, :2] - agent[:2]).T) < 2 * RADIUS
+    walls = np.hypot(*(POINTS - body[:2]).T) < RADIUS
+    others = np.hypot(*(obstacles[:, :2] - body[:2]).T) < 2 * RADIUS
     crashed = bool(walls.any() or others.any())
-    goal = bool(agent[Y] > jam.ROOM) and not crashed
-    reached = State(agent, obstacles, _progress(agent), state.time + 1)
-    slow = 0.05 * (abs(agent[SPEED]) < 0.005)
+    goal = bool(body[Y] > jam.ROOM) and not crashed
+    reached = State(body, obstacles, _progress(body), state.time + 1)
+    slow = 0.05 * (abs(body[SPEED]) < 0.005)
     reward = reached.progress - state.progress - 0.05 - slow + 10.0 * goal
     return Step(reached, reward, crashed, goal, crashed or goal or reached.time >= TIME_LIMIT)
 
@@ -102,24 +102,24 @@ def step(rng: np.random.Generator, state: State, action: int) -> Step:
     count = len(state.obstacles)
     acceleration = rng.choice(jam.ACCELERATIONS, count, p=(0.2, 0.6, 0.2))
     drive = np.stack([acceleration, rng.choice(jam.OBSTACLE_TURNS, count)], axis=-1)
-    agent, obstacles, gone = move(state, action, drive)
+    body, obstacles, gone = move(state, action, drive)
     for n in np.flatnonzero(gone):
-        obstacles[n] = _appear(rng, agent)
-    return finished(state, agent, obstacles)
+        obstacles[n] = _appear(rng, body)
+    return finished(state, body, obstacles)
 
 
 def observe(state: State) -> np.ndarray:
     """(396,) LIDAR of the walls (360), the 8 nearest obstacles (32), x, y, heading, speed."""
-    agent = state.agent
-    offset = POINTS - agent[:2]
+    body = state.body
+    offset = POINTS - body[:2]
     distance = np.hypot(*offset.T)
     near = distance < 1.0
-    angle = np.arctan2(offset[near, 1], offset[near, 0]) - agent[ANGLE]
+    angle = np.arctan2(offset[near, 1], offset[near, 0]) - body[ANGLE]
     bins = np.floor((angle + np.pi) % (2 * np.pi) * (jam.LIDAR_BINS / (2 * np.pi))).astype(int)
     scan = np.full(jam.LIDAR_BINS, np.inf)
     np.minimum.at(scan, bins % jam.LIDAR_BINS, distance[near])
     scan[np.isinf(scan)] = 0.0
-    pose = [agent[X], agent[Y], _wrapped(agent[ANGLE]), agent[SPEED]]
+    pose = [body[X], body[Y], _wrapped(body[ANGLE]), body[SPEED]]
     return np.concatenate([scan, _seen(state).ravel(), pose])
 
 
@@ -129,11 +129,11 @@ def _wrapped(angle: np.ndarray) -> np.ndarray:
 
 def _seen(state: State) -> np.ndarray:
     """(8, 4) the nearest obstacles in the agent's frame."""
-    agent = state.agent
-    offset = state.obstacles[:, :2] - agent[:2]
+    body = state.body
+    offset = state.obstacles[:, :2] - body[:2]
     order = np.argsort((offset**2).sum(axis=-1), kind="stable")[: jam.SEEN_OBSTACLES]
-    (x, y), cos, sin = offset[order].T, np.cos(agent[ANGLE]), np.sin(agent[ANGLE])
-    turn = _wrapped(state.obstacles[order, ANGLE] - agent[ANGLE])
+    (x, y), cos, sin = offset[order].T, np.cos(body[ANGLE]), np.sin(body[ANGLE])
+    turn = _wrapped(state.obstacles[order, ANGLE] - body[ANGLE])
     speed = state.obstacles[order, SPEED]
     return np.stack([x * cos + y * sin, y * cos - x * sin, turn, speed], axis=-1)
 

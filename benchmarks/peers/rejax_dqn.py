@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from benchmarks.measure import Row, measure
 from benchmarks.peers import environments
 from benchmarks.setups import quick_tasks
-from rp_jax.envs import base, jam
+from rp_jax import arrays
+from rp_jax.envs import jam
 from rp_jax.planning import networks
-from rp_jax.planning.pmdp import encode
+from rp_jax.planning.percept import encode
 
 ITERATIONS = 100
 
@@ -50,7 +51,7 @@ class Jam:
         """A step that begins anew after an end, as gymnax does: by drawing a start every time."""
         move, renew = jax.random.split(key)
         reached, outcome = jam.step(move, state, action, params)
-        state = base.select(outcome.done, jam.reset(renew, params), reached)
+        state = arrays.select(outcome.done, jam.reset(renew, params), reached)
         return self._seen(state, params), state, outcome.reward, outcome.done, {}
 
 
@@ -75,7 +76,7 @@ def run() -> list[Row]:
         polyak=1 - planning.learner.polyak,
         total_timesteps=planning.steps,
     ).replace(
-        agent=EpsilonGreedyPolicy(DiscreteQNetwork)(
+        body=EpsilonGreedyPolicy(DiscreteQNetwork)(
             hidden_layer_sizes=network.hidden, action_dim=15, activation=nn.silu
         )
     )

@@ -5,17 +5,18 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rp_jax.envs import base
-from rp_jax.hazards import SubRMDP, WallPoint, Window, padded_window, sample_speed
-from rp_jax.kinematics import (
-    AgentModel,
+from rp_jax import arrays
+from rp_jax.dynamics import (
     Vehicle,
+    VehicleModel,
     control_table,
     independent_controls,
     make_vehicle,
     squared_distance,
     to_ego,
 )
+from rp_jax.envs import contract
+from rp_jax.hazards import SubRMDP, WallPoint, Window, padded_window, sample_speed
 from rp_jax.validate import number
 
 # --- the agent ---
@@ -24,9 +25,9 @@ ACCELERATIONS = (-0.02, 0.0, 0.02)  # lengths / step^2
 TURNS = (-0.1, 0.0, 0.1)  # radians / step
 
 
-def make_agent() -> AgentModel:
+def make_agent() -> VehicleModel:
     """A car that never reverses, and what it does while threats are measured: mostly brake."""
-    return AgentModel(
+    return VehicleModel(
         actions=control_table(ACCELERATIONS, TURNS),
         baseline=independent_controls(ACCELERATIONS, (0.7, 0.2, 0.1), TURNS, (0.2, 0.6, 0.2)),
         speeds=jnp.asarray([0.0, 0.02, 0.04, 0.06, 0.08, 0.1]),
@@ -56,37 +57,37 @@ class Pedestrian(struct.PyTreeNode):
         """(..., 2) what decides whether it walks, and whether it turns round."""
         return jax.random.uniform(key, (*shape, 2))
 
-    def step(self, hazard: Walker, agent: Vehicle, noise: Array) -> Walker:
+    def step(self, hazard: Walker, body: Vehicle, noise: Array) -> Walker:
         """It walks in 7 of 10 steps, but into no car that stands; it turns round in 1 of 20."""
         way = jnp.where(noise[1] < 0.05, -hazard.way, hazard.way)
         moved = Walker(hazard.position + self.pace * hazard.way, way)
-        stays = (noise[0] > 0.7) | ((agent.speed <= 0) & self.hits(agent, moved))
+        stays = (noise[0] > 0.7) | ((body.speed <= 0) & self.hits(body, moved))
         return moved.replace(position=jnp.where(stays, hazard.position, moved.position))
 
-    def hits(self, agent: Vehicle, hazard: Walker) -> Array:
+    def hits(self, body: Vehicle, hazard: Walker) -> Array:
         """Centres nearer than `distance`."""
-        return squared_distance(hazard.position, agent.position) < jnp.square(self.distance)
+        return squared_distance(hazard.position, body.position) < jnp.square(self.distance)
 
-    def in_reach(self, agent: Vehicle, hazard: Walker) -> Array:
+    def in_reach(self, body: Vehicle, hazard: Walker) -> Array:
         """In the window."""
-        return self.window.contains(to_ego(hazard.position - agent.position, agent.heading))
+        return self.window.contains(to_ego(hazard.position - body.position, body.heading))
 
-    def features(self, agent: Vehicle, hazard: Walker) -> Array:
+    def features(self, body: Vehicle, hazard: Walker) -> Array:
         """(5,) in the car's frame: position (2), way (2); the car's speed."""
-        relative = to_ego(hazard.position - agent.position, agent.heading)
-        way = to_ego(hazard.way, agent.heading)
-        return jnp.concatenate([relative, way, agent.speed[None]])
+        relative = to_ego(hazard.position - body.position, body.heading)
+        way = to_ego(hazard.way, body.heading)
+        return jnp.concatenate([relative, way, body.speed[None]])
 
     def mirrored(self, features: Array) -> Array:
         """What is on the left comes to the right."""
         return features * jnp.broadcast_to(jnp.asarray([1.0, -1.0, 1.0, -1.0, 1.0]), features.shape)
 
-    def sample(self, key: Array, agent: AgentModel) -> tuple[Vehicle, Walker]:
+    def sample(self, key: Array, model: VehicleModel) -> tuple[Vehicle, Walker]:
         """Anywhere in the window, walking anywhere, before a car of any speed."""
         where, turn, fast = jax.random.split(key, 3)
         angle = jax.random.uniform(turn, (), float, -jnp.pi, jnp.pi)
         way = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-        car = make_vehicle(jnp.zeros(2), 0.0, sample_speed(fast, agent.speeds))
+        car = make_vehicle(jnp.zeros(2), 0.0, sample_speed(fast, model.speeds))
         return car, Walker(self.window.sample(where), way)
 
     def state_of(self, features: Array) -> tuple[Vehicle, Walker]:
@@ -102,14 +103,13 @@ KERB = 0.6  # parked cars stand along y = +-KERB, a car every GAP
 GAP = 0.4
 PAVEMENT = 0.8  # pedestrians turn round at y = +-PAVEMENT
 SEEN = 4  # pedestrians observed
-LIDAR_BINS = 0
 SCALE: tuple[float, ...] = (0.25, 2.0, 1.0, 1.0, 10.0) + (1.0, 1.0, 1.0, 1.0) * SEEN
 
 
 class State(struct.PyTreeNode):
     """The car and the pedestrians."""
 
-    agent: Vehicle
+    body: Vehicle
     walkers: Walker  # leading axis (N,)
     time: Array  # () int32
 
@@ -117,7 +117,7 @@ class State(struct.PyTreeNode):
 class Params(struct.PyTreeNode):
     """Build by `make_params`."""
 
-    agent: AgentModel
+    body: VehicleModel
     pedestrian: Pedestrian
     parked: WallPoint
     time_limit: Array  # () int32, steps
@@ -133,17 +133,17 @@ def make_params(pedestrians: int = 6, time_limit: int = 100) -> Params:
     """
     number("pedestrians", pedestrians, least=1, most=100, integer=True)
     number("time_limit", time_limit, least=1, most=10**9, integer=True)
-    agent, distance, pace, horizon = make_agent(), 0.15, 0.03, 8
+    body, distance, pace, horizon = make_agent(), 0.15, 0.03, 8
     pedestrian = Pedestrian(
         distance=jnp.asarray(distance, float),
         pace=jnp.asarray(pace, float),
-        window=padded_window(agent, horizon, distance + horizon * pace),
+        window=padded_window(body, horizon, distance + horizon * pace),
         horizon=horizon,
     )
     return Params(
-        agent=agent,
+        body=body,
         pedestrian=pedestrian,
-        parked=WallPoint.create(agent, radius=0.3, horizon=5),
+        parked=WallPoint.create(body, radius=0.3, horizon=5),
         time_limit=jnp.asarray(time_limit, jnp.int32),
         beta=jnp.asarray(0.999, float),
         pedestrians=pedestrians,
@@ -159,30 +159,30 @@ def reset(key: Array, params: Params) -> State:
     up = jnp.where(jax.random.bernoulli(side, 0.5, (count,)), 1.0, -1.0)
     way = jnp.stack([jnp.zeros(count), up], axis=-1)
     car = make_vehicle(jnp.zeros(2), 0.0, 0.0)
-    return State(agent=car, walkers=Walker(position, way), time=jnp.asarray(0, jnp.int32))
+    return State(body=car, walkers=Walker(position, way), time=jnp.asarray(0, jnp.int32))
 
 
-def step(key: Array, state: State, action: Array, params: Params) -> tuple[State, base.Outcome]:
+def step(key: Array, state: State, action: Array, params: Params) -> tuple[State, contract.Outcome]:
     """All move; 10 for each unit of way made, -.05 a step, 5 at the end of the road."""
     source = params.pedestrian
 
     def walk(n: Array, walker: Walker) -> Walker:
-        moved = source.step(walker, state.agent, source.draw(jax.random.fold_in(key, n)))
+        moved = source.step(walker, state.body, source.draw(jax.random.fold_in(key, n)))
         # The world's business: the sub-R-MDP knows nothing of pavements.
         back = jnp.sign(moved.position[1]) * jnp.asarray([0.0, -1.0])
         return moved.replace(way=jnp.where(jnp.abs(moved.position[1]) > PAVEMENT, back, moved.way))
 
     reached = State(
-        agent=params.agent.step(state.agent, params.agent.control(action)),
+        body=params.body.step(state.body, params.body.control(action)),
         walkers=jax.vmap(walk)(jnp.arange(params.pedestrians), state.walkers),
         time=state.time + 1,
     )
-    hit = causes(reached, params)
+    hit = collisions(reached, params)
     crashed = hit["pedestrian"] | hit["parked"]
-    goal = (reached.agent.position[0] > LENGTH) & ~crashed
-    way = reached.agent.position[0] - state.agent.position[0]
-    terminated, truncated = base.ended(crashed | goal, reached.time, params.time_limit)
-    return reached, base.Outcome(
+    goal = (reached.body.position[0] > LENGTH) & ~crashed
+    way = reached.body.position[0] - state.body.position[0]
+    terminated, truncated = contract.ended(crashed | goal, reached.time, params.time_limit)
+    return reached, contract.Outcome(
         reward=10.0 * way - 0.05 + 5.0 * goal,
         danger=crashed.astype(way.dtype),
         terminated=terminated,
@@ -194,45 +194,35 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
 def observe(state: State, params: Params) -> Array:
     """(21,) position (2), heading (2) and speed; of 4 pedestrians, the nearest first, position and
     way in the car's frame, at (3, 0) where there are fewer."""
-    car, n = state.agent, params.pedestrians
+    car, n = state.body, params.pedestrians
     see = lambda walker: params.pedestrian.features(car, walker)[:4]  # noqa: E731
     rows = jax.vmap(see)(state.walkers)
-    order = base.ranks(squared_distance(state.walkers.position, car.position[None]))
+    order = arrays.ranks(squared_distance(state.walkers.position, car.position[None]))
     blank = jnp.tile(jnp.asarray([[3.0, 0.0, 0.0, 0.0]], rows.dtype), (max(n, SEEN), 1))
     nearest = blank.at[order].set(rows)[:SEEN]
     return jnp.concatenate([car.position, car.heading, car.speed[None], nearest.reshape(-1)])
 
 
-def hazards(state: State, params: Params) -> dict[str, base.Hazards]:
+def hazards(state: State, params: Params) -> dict[str, contract.Hazards]:
     """All pedestrians, and the parked cars near by."""
-    along = GAP * (jnp.round(state.agent.position[0] / GAP) + jnp.arange(-3.0, 4.0))
+    along = GAP * (jnp.round(state.body.position[0] / GAP) + jnp.arange(-3.0, 4.0))
     sides = [jnp.stack([along, jnp.full(7, y, along.dtype)], axis=-1) for y in (KERB, -KERB)]
     return {
-        "pedestrian": base.Hazards(state.walkers, jnp.ones(params.pedestrians, bool)),
-        "parked": base.Hazards(jnp.concatenate(sides), jnp.ones(14, bool)),
+        "pedestrian": contract.Hazards(state.walkers, jnp.ones(params.pedestrians, bool)),
+        "parked": contract.Hazards(jnp.concatenate(sides), jnp.ones(14, bool)),
     }
 
 
-def causes(state: State, params: Params) -> dict[str, Array]:
+def collisions(state: State, params: Params) -> dict[str, Array]:
     """Whether a pedestrian or a parked car is being hit."""
     found, subs = hazards(state, params), sub_rmdps(params)
     hits = {kind: jax.vmap(sub.source.hits, (None, 0)) for kind, sub in subs.items()}
-    return {kind: jnp.any(hits[kind](state.agent, found[kind].state)) for kind in subs}
-
-
-def clearance(position: Array, params: Params) -> Array:
-    """() infinite: asked under plans only."""
-    return jnp.full((), jnp.inf, position.dtype)
+    return {kind: jnp.any(hits[kind](state.body, found[kind].state)) for kind in subs}
 
 
 def sub_rmdps(params: Params) -> dict[str, SubRMDP]:
     """One car and one pedestrian; one car and one parked car."""
     return {
-        "pedestrian": SubRMDP(agent=params.agent, source=params.pedestrian, beta=params.beta),
-        "parked": SubRMDP(agent=params.agent, source=params.parked, beta=params.beta),
+        "pedestrian": SubRMDP(body=params.body, source=params.pedestrian, beta=params.beta),
+        "parked": SubRMDP(body=params.body, source=params.parked, beta=params.beta),
     }
-
-
-def num_actions(params: Params) -> int:
-    """9 = 3 accelerations x 3 turns."""
-    return params.agent.num_threats

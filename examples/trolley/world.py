@@ -9,10 +9,9 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rp_jax.adapters.physics import Body, PipelineAgent
-from rp_jax.envs import base
-from rp_jax.hazards import SubRMDP, Window
-from rp_jax.kinematics import (
+from rp_jax import arrays
+from rp_jax.adapters.physics import BraxBody, JointState
+from rp_jax.dynamics import (
     ControlDistribution,
     Vehicle,
     advance,
@@ -20,6 +19,8 @@ from rp_jax.kinematics import (
     make_vehicle,
     squared_distance,
 )
+from rp_jax.envs import contract
+from rp_jax.hazards import SubRMDP, Window
 from rp_jax.validate import number, positive
 
 FASTEST = 0.6  # metres / second that the trolley is asked for
@@ -52,26 +53,25 @@ GOAL, NEAR = (2.7, 2.7), 0.3  # the load is to come this near
 SWING, RATE = 0.6, 2.0  # radians, radians / second: greatest that threats are learned for
 SPEEDS = (0.0, 0.01, 0.02, 0.03)  # of carts, metres / step
 SEEN = 4  # carts observed
-LIDAR_BINS = 0
 SCALE: tuple[float, ...] = (0.5, 0.5, 3.0, 3.0, 2.0, 2.0, 1.0, 1.0) + (1.0, 1.0, 20.0, 20.0) * SEEN
 
 
-def make_agent() -> PipelineAgent:
+def make_agent() -> BraxBody:
     """Nine velocities to ask for; while threats are measured, mostly that of standing still."""
     ways = (-FASTEST, 0.0, FASTEST)
     table = jnp.asarray([(x, y) for x in ways for y in ways])
     still = jnp.where(jnp.all(table == 0, axis=-1), 0.6, 0.05)
-    return PipelineAgent(table, ControlDistribution(table, still), MODEL, mirror=(1, -1))
+    return BraxBody(table, ControlDistribution(table, still), MODEL, mirror=(1, -1))
 
 
-def load_of(body: Body) -> Array:
+def load_of(body: JointState) -> Array:
     """(2,) where the load hangs, seen from above."""
     x, y = body.q[2], body.q[3]  # about the x axis first, then about the turned y axis
     return body.q[:2] + ROPE * jnp.stack([-jnp.sin(y), jnp.cos(y) * jnp.sin(x)])
 
 
 class Cart(struct.PyTreeNode):
-    """A vehicle that drives at random; a `rp_jax.hazards.HazardSource` for any `Body`."""
+    """A vehicle that drives at random; a `rp_jax.hazards.HazardSource` for any `JointState`."""
 
     distance: Array  # () from the load's middle to the cart's, at which they meet
     speeds: Array  # (S,) that it reaches, ascending
@@ -82,24 +82,24 @@ class Cart(struct.PyTreeNode):
 
     def draw(self, key: Array, shape: tuple[int, ...] = ()):
         """Its controls."""
-        return self.behaviour.sample(key, shape)
+        return self.behaviour.draw(key, shape)
 
-    def step(self, hazard: Vehicle, agent: Body, noise) -> Vehicle:
+    def step(self, hazard: Vehicle, body: JointState, noise) -> Vehicle:
         """It drives on, regardless of the load."""
         return advance(hazard, noise, self.speeds)
 
-    def hits(self, agent: Body, hazard: Vehicle) -> Array:
+    def hits(self, body: JointState, hazard: Vehicle) -> Array:
         """The load is nearer than `distance`."""
-        return squared_distance(hazard.position, load_of(agent)) < jnp.square(self.distance)
+        return squared_distance(hazard.position, load_of(body)) < jnp.square(self.distance)
 
-    def in_reach(self, agent: Body, hazard: Vehicle) -> Array:
+    def in_reach(self, body: JointState, hazard: Vehicle) -> Array:
         """In the window."""
-        return self.window.contains(hazard.position - load_of(agent))
+        return self.window.contains(hazard.position - load_of(body))
 
-    def features(self, agent: Body, hazard: Vehicle) -> Array:
+    def features(self, body: JointState, hazard: Vehicle) -> Array:
         """(11,) position from the load (2), heading (2), speed; angles of swing (2); rates (4)."""
-        relative = hazard.position - load_of(agent)
-        rest = [hazard.speed[None], agent.q[2:], agent.qd]
+        relative = hazard.position - load_of(body)
+        rest = [hazard.speed[None], body.q[2:], body.qd]
         return jnp.concatenate([relative, hazard.heading, *rest])
 
     def mirrored(self, features: Array) -> Array:
@@ -107,11 +107,11 @@ class Cart(struct.PyTreeNode):
         signs = [1, -1, 1, -1, 1, -1, 1, 1, -1, -1, 1]
         return features * jnp.broadcast_to(jnp.asarray(signs, features.dtype), features.shape)
 
-    def sample(self, key: Array, agent: PipelineAgent) -> tuple[Body, Vehicle]:
+    def sample(self, key: Array, model: BraxBody) -> tuple[JointState, Vehicle]:
         """Any swing of the load and any speed, and a cart anywhere in the window."""
         swing, move, rate, where, turn, fast = jax.random.split(key, 6)
         draw = lambda key, most: jax.random.uniform(key, (2,), float, -most, most)  # noqa: E731
-        body = Body(
+        body = JointState(
             q=jnp.concatenate([jnp.zeros(2), draw(swing, SWING)]),
             qd=jnp.concatenate([draw(move, 1.2 * FASTEST), draw(rate, RATE)]),
         )
@@ -119,9 +119,9 @@ class Cart(struct.PyTreeNode):
         position = load_of(body) + self.window.sample(where)
         return body, make_vehicle(position, angle, jax.random.choice(fast, self.speeds))
 
-    def state_of(self, features: Array) -> tuple[Body, Vehicle]:
+    def state_of(self, features: Array) -> tuple[JointState, Vehicle]:
         """The inverse of `features`, the trolley at the origin."""
-        body = Body(q=jnp.concatenate([jnp.zeros(2), features[5:7]]), qd=features[7:])
+        body = JointState(q=jnp.concatenate([jnp.zeros(2), features[5:7]]), qd=features[7:])
         heading = features[2:4] / jnp.linalg.norm(features[2:4])
         return body, Vehicle(load_of(body) + features[:2], heading, features[4])
 
@@ -129,7 +129,7 @@ class Cart(struct.PyTreeNode):
 class State(struct.PyTreeNode):
     """The body and the carts."""
 
-    agent: Body
+    body: JointState
     carts: Vehicle  # leading axis (N,)
     time: Array  # () int32
 
@@ -137,7 +137,7 @@ class State(struct.PyTreeNode):
 class Params(struct.PyTreeNode):
     """Build by `make_params`."""
 
-    agent: PipelineAgent
+    body: BraxBody
     cart: Cart
     time_limit: Array  # () int32, steps
     beta: Array  # () discount of danger
@@ -163,7 +163,7 @@ def make_params(carts: int = 6, *, time_limit: int = 150, horizon: int = 12) -> 
     far = jnp.full(2, horizon * (0.12 * FASTEST + SPEEDS[-1]) + 2 * ROPE * SWING + distance)
     turns = (-0.15, -0.05, 0.0, 0.05, 0.15)
     return Params(
-        agent=make_agent(),
+        body=make_agent(),
         cart=Cart(
             distance=jnp.asarray(distance, float),
             speeds=jnp.asarray(SPEEDS, float),
@@ -180,7 +180,7 @@ def make_params(carts: int = 6, *, time_limit: int = 150, horizon: int = 12) -> 
 def reset(key: Array, params: Params) -> State:
     """The load swings a little in the near corner; carts are at least 1.3 m from it."""
     swing, where, turn, fast = jax.random.split(key, 4)
-    body = Body(
+    body = JointState(
         q=jnp.concatenate([jnp.full(2, 0.3), 0.1 * jax.random.normal(swing, (2,))]),
         qd=jnp.zeros(4),
     )
@@ -192,34 +192,34 @@ def reset(key: Array, params: Params) -> State:
     heading = jax.random.uniform(turn, (count,), float, -jnp.pi, jnp.pi)
     speed = jax.random.choice(fast, params.cart.speeds, (count,))
     carts = jax.vmap(make_vehicle)(position, heading, speed)
-    return State(agent=body, carts=carts, time=jnp.asarray(0, jnp.int32))
+    return State(body=body, carts=carts, time=jnp.asarray(0, jnp.int32))
 
 
-def _way_left(body: Body) -> Array:
+def _way_left(body: JointState) -> Array:
     return jnp.sqrt(squared_distance(load_of(body), jnp.asarray(GOAL)))
 
 
-def step(key: Array, state: State, action: Array, params: Params) -> tuple[State, base.Outcome]:
+def step(key: Array, state: State, action: Array, params: Params) -> tuple[State, contract.Outcome]:
     """All move; 10 for each metre nearer to the goal, -.05 a step, 5 at the goal."""
     source = params.cart
 
     def drive(n: Array, cart: Vehicle) -> Vehicle:
-        moved = source.step(cart, state.agent, source.draw(jax.random.fold_in(key, n)))
+        moved = source.step(cart, state.body, source.draw(jax.random.fold_in(key, n)))
         inward = jnp.where(moved.position < 0, 1.0, -1.0) * jnp.abs(moved.heading)
         outside = (moved.position < 0) | (moved.position > SIDE)
         return moved.replace(heading=jnp.where(outside, inward, moved.heading))
 
     reached = State(
-        agent=params.agent.step(state.agent, params.agent.control(action)),
+        body=params.body.step(state.body, params.body.control(action)),
         carts=jax.vmap(drive)(jnp.arange(params.carts), state.carts),
         time=state.time + 1,
     )
-    crashed = causes(reached, params)["cart"]
-    left = _way_left(reached.agent)
+    crashed = collisions(reached, params)["cart"]
+    left = _way_left(reached.body)
     goal = (left < NEAR) & ~crashed
-    terminated, truncated = base.ended(crashed | goal, reached.time, params.time_limit)
-    return reached, base.Outcome(
-        reward=10.0 * (_way_left(state.agent) - left) - 0.05 + 5.0 * goal,
+    terminated, truncated = contract.ended(crashed | goal, reached.time, params.time_limit)
+    return reached, contract.Outcome(
+        reward=10.0 * (_way_left(state.body) - left) - 0.05 + 5.0 * goal,
         danger=crashed.astype(left.dtype),
         terminated=terminated,
         truncated=truncated,
@@ -230,37 +230,27 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
 def observe(state: State, params: Params) -> Array:
     """(24,) from the load to the goal (2), angles of swing (2), rates (4); of the 4 nearest carts,
     position from the load and velocity, at (3, 0) where there are fewer."""
-    body, carts, n = state.agent, state.carts, params.carts
+    body, carts, n = state.body, state.carts, params.carts
     relative = carts.position - load_of(body)[None]
     rows = jnp.concatenate([relative, carts.heading * carts.speed[:, None]], axis=-1)
-    order = base.ranks(squared_distance(relative, jnp.zeros((1, 2))))
+    order = arrays.ranks(squared_distance(relative, jnp.zeros((1, 2))))
     blank = jnp.tile(jnp.asarray([[3.0, 0.0, 0.0, 0.0]], rows.dtype), (max(n, SEEN), 1))
     nearest = blank.at[order].set(rows)[:SEEN]
     own = [jnp.asarray(GOAL) - load_of(body), body.q[2:], body.qd]
     return jnp.concatenate([*own, nearest.reshape(-1)])
 
 
-def hazards(state: State, params: Params) -> dict[str, base.Hazards]:
+def hazards(state: State, params: Params) -> dict[str, contract.Hazards]:
     """All carts."""
-    return {"cart": base.Hazards(state.carts, jnp.ones(params.carts, bool))}
+    return {"cart": contract.Hazards(state.carts, jnp.ones(params.carts, bool))}
 
 
-def causes(state: State, params: Params) -> dict[str, Array]:
+def collisions(state: State, params: Params) -> dict[str, Array]:
     """Whether a cart is being hit."""
-    hits = jax.vmap(params.cart.hits, (None, 0))(state.agent, state.carts)
+    hits = jax.vmap(params.cart.hits, (None, 0))(state.body, state.carts)
     return {"cart": jnp.any(hits)}
-
-
-def clearance(position: Array, params: Params) -> Array:
-    """() infinite: asked under plans only."""
-    return jnp.full((), jnp.inf, position.dtype)
 
 
 def sub_rmdps(params: Params) -> dict[str, SubRMDP]:
     """The body and one cart, on a floor without end."""
-    return {"cart": SubRMDP(agent=params.agent, source=params.cart, beta=params.beta)}
-
-
-def num_actions(params: Params) -> int:
-    """9 velocities to ask for."""
-    return params.agent.num_threats
+    return {"cart": SubRMDP(body=params.body, source=params.cart, beta=params.beta)}

@@ -4,26 +4,27 @@ A word that begins with @ is a file of another run, which is made first.
 """
 
 _AHEAD = (
-    "{jam_steps} --baseline plans --x 0.002 --lookahead 8 --learning-toll 1 --learning-penalty 50"
-    " --fewest-obstacles 0 --threat @jam_plans/threat --no-figures"
+    "{jam_steps} --baseline plans --x 0.002 --lookahead 8 --insecure-penalty 1"
+    " --learning-penalty 50 --fewest-obstacles 0 --threat @jam_plans/threat --no-figures"
 )
 COMMANDS: dict[str, str] = {
     "frozen_lake": "frozen_lake --no-figures {frozen_lake}",
     "theorems": "theorems --instances {instances}",
     # RP, with the tuned recipe and the paper's baseline policy, and under plans.
     "circuit": "circuit {seeds} {circuit_steps} {wall}",
-    "circuit_lost": "circuit {seeds} {circuit_steps} {wall} --lost 0.1",
+    "circuit_lost": "circuit {seeds} {circuit_steps} {wall} --hide-position 0.1",
     "jam": "jam {seeds} {jam_steps} {wall} {obstacle} --test-obstacles 3 8 15 30 50",
     "point_gather": "point_gather {seeds} {gather_steps} {bomb}",
     "point_gather_x01": "point_gather {seeds} {gather_steps} --x 0.1 --threat @point_gather/threat"
     " --no-figures",
-    "circuit_plans": "circuit {seeds} {circuit_steps} --baseline plans --lost 0.1",
-    "jam_plans": "jam {seeds} {jam_steps} {obstacle} --baseline plans --x 0.001 --learning-toll 1"
-    " --learning-penalty 50 --test-obstacles 3 8 15 30 50",
+    "circuit_plans": "circuit {seeds} {circuit_steps} --baseline plans --hide-position 0.1",
+    "jam_plans": "jam {seeds} {jam_steps} {obstacle} --baseline plans --x 0.001"
+    " --insecure-penalty 1 --learning-penalty 50 --test-obstacles 3 8 15 30 50",
     "jam_ahead": f"jam {{seeds}} {_AHEAD} --test-obstacles 3 8 15",
     "jam_ahead_crowds": f"jam {{few}} {_AHEAD} --test-obstacles 30 50",  # slow
     # As many steps as the paper's returns need (benchmarks.to_return).
-    "circuit_brief": "circuit {brief} {circuit_brief} --baseline plans --lost 0.1 --no-figures",
+    "circuit_brief": "circuit {brief} {circuit_brief} --baseline plans --hide-position 0.1"
+    " --no-figures",
     "jam_brief": "jam {brief} {jam_brief} {wall} {obstacle} --no-figures",
     # The paper's networks and settings, its threat functions included.
     "circuit_paper": "circuit --recipe paper {episodes} {paper_steps} {paper_wall}",

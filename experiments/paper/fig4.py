@@ -4,11 +4,10 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from experiments.paper.scores import read
+from experiments.paper.scores import ERRORS, errors, read
 from experiments.paper.section import Section, Table
 
 TITLE = "Figure 4: Jam and its threats"
-ERRORS = "Threat models against fresh labels, and sums on states of the task"
 PICTURES = {
     "animation.gif": "(a) The room, and the threat of each action; inadmissible ones are crossed.",
     "figures/threat_of_one_obstacle.png": "(b) One obstacle: least threat over the actions, with "
@@ -34,14 +33,3 @@ def tell(results: list[dict[str, Any]]) -> Section:
         tables=[Table(ERRORS, [errors(row) for row in results])],
         figures={Path(name).name: caption for name, caption in PICTURES.items()},
     )
-
-
-def errors(row: dict[str, Any]) -> dict[str, Any]:
-    """Of a table: how far a threat model is off, by a row of its report."""
-    return {
-        "hazard": row["hazard"],
-        "of": row["of"],
-        "mean absolute error": f"{row['mae']:.4f}",
-        "bias": f"{row['bias']:+.4f}",
-        "unsafe pairs called safe, %": f"{100 * row['unsafe_called_safe']:.2f}",
-    }

@@ -6,38 +6,30 @@ from typing import Any
 
 import numpy as np
 
-from experiments import tables
 from experiments.paper import published, scores
 from experiments.paper.section import Claim, Section, Table, holds
 from rp_jax import statistics
+from rp_jax.runs import tables
 
 TITLE = "Figure 5: learning curves"
-# Runs of RP, steps of MPC.
-TASKS: dict[str, tuple[tuple[str, ...], tuple[int, ...]]] = {
-    "point_gather": (("point_gather", "point_gather_x01"), (1, 2)),
-    "circuit": (("circuit",), (3, 4, 5)),
-    "jam": (("jam",), (2, 3)),
-}
 ALMOST = 80  # per cent
 TENTH = 0.1  # of the steps, over which returns are compared
 COMPETITIVE = 0.9  # of the best return that keeps c
-KEPT = ("method", "seed", "steps", "episodes", "return_mean", "crashes")
 
 
 def run(sources: Any, folder: Path) -> dict[str, Any]:
     """By task, rows per chunk, method and seed; rows of MPC; what RP and others end with."""
     found: dict[str, Any] = {}
-    for env, (runs, searches) in TASKS.items():
+    for env, runs in scores.LEARNED.items():
         variant = published.LEARNED_ON[env]
         files = [sources(name) / "metrics.jsonl" for name in runs]
         history = [row for file in files for row in scores.read_lines(file)]
         history += scores.curves(sources, env)
         rows = [row for name in runs for row in scores.read(sources(name) / "table.json")]
         rows += scores.evaluated(sources, env)
-        files = [sources(f"mpc_{env}_{steps}") / "table.json" for steps in searches]
-        levels = [row for file in files for row in scores.read(file)]
+        levels = scores.searched(sources, env, scores.SEARCHES[env])
         found[env] = {
-            "history": [{key: row[key] for key in KEPT} for row in history],
+            "history": [{key: row[key] for key in scores.KEPT} for row in history],
             "evaluated": [row for row in rows if row["variant"] == variant],
             "levels": [row for row in levels if row["variant"] == variant],
         }
@@ -62,7 +54,7 @@ def tell(results: dict[str, Any]) -> Section:
     learned = []
     for env, of in results.items():
         for row in scores.summed_up(of["evaluated"] + of["levels"]):
-            learned.append(line(env, row))
+            learned.append(scores.line(env, row))
     rising = [row for env, of in results.items() for row in rise(env, of)]
     claims = [claim for env in ("circuit", "jam") for claim in _ahead(results[env], env)]
     return Section(
@@ -79,18 +71,6 @@ def tell(results: dict[str, Any]) -> Section:
             "animation.gif": "Point Gather, x = .5: an episode, and the threat of each action.",
         },
     )
-
-
-def line(env: str, row: dict[str, Any]) -> dict[str, Any]:
-    """Of a table: what a method's agents do on a task after learning."""
-    return {
-        "task": env,
-        "method": row["method"],
-        "seeds": row["seeds"],
-        "return": tables.earned(row),
-        "crashes": tables.crashed(row),
-        "crash rate, % [95 %]": tables.percent(row),
-    }
 
 
 def rise(env: str, of: dict[str, Any]) -> list[dict[str, Any]]:

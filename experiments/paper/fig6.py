@@ -8,12 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import runs, tasks
+import rp_jax
+from experiments.paper.scores import read
 from experiments.paper.section import Claim, Section, holds
-from rp_jax import evaluate, storage
+from rp_jax import evaluation
 from rp_jax.baselines import mpc
+from rp_jax.cli.experiment import world_of
 from rp_jax.envs import circuit
-from rp_jax.planning import loop
+from rp_jax.streams import Stream, key_of
 
 TITLE = "Figure 6: trajectories on Circuit"
 TRACKS = ("default", "narrowed", "circle")
@@ -22,42 +24,43 @@ EPISODES, STEPS_AHEAD = 8, 4
 
 def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
     """Per method and track, where the agent went, and where it crashed; keeps an animation."""
-    lost = sources("circuit_lost")
-    loaded = runs.load(lost)
-    (folder / "animation.gif").write_bytes((lost / "animation.gif").read_bytes())
-    planning = loaded.config.planning
-    agents = sources("dqn_circuit") / "dqn" / "agent"
-    members = storage.read_manifest(agents, "Q-network")["about"]["members"]
-    first = next(i for i, member in enumerate(members) if member["learning_penalty"] == 0)
+    made = sources("circuit_lost")
+    (folder / "animation.gif").write_bytes((made / "animation.gif").read_bytes())
+    world, agent = world_of(made), rp_jax.load(made)[0]
+    penalty = read(made / "config.json")["config"]["penalty"]
+    others = rp_jax.load(sources("dqn_circuit") / "dqn")
+    (free, *_) = (a for a, m in zip(others, others.members, strict=True) if not m.learning_penalty)
     found = []
     for track in TRACKS:
-        pmdp = loaded.pmdp(track)
-        told = pmdp.params.replace(lost=jnp.zeros(()))  # as DQN has learned
-        free = pmdp.replace(params=told, threats=None, x=jnp.asarray(jnp.inf))
-        dqn = runs.agents(agents, free, planning, len(members))
-        network = loop.make_network(planning, pmdp)
-        values = functools.partial(evaluate.action_values, network)
-        tree = mpc.make_search(circuit, pmdp.params, STEPS_AHEAD, loaded.config.penalty)
+        params = world.params(track)
+        told = params.replace(hide_position=jnp.zeros(()))  # as DQN has learned
+        tree = mpc.make_search(circuit, params, STEPS_AHEAD, penalty)
         cases = {
-            "RP": (pmdp, values, jax.tree.map(lambda a: a[0], loaded.params)),
+            "RP": (agent.pmdp.replace(params=params), _values(agent), agent.weights),
             f"MPC, {STEPS_AHEAD} steps": (mpc.omniscient(tree), mpc.values, tree),
-            "DQN, no penalty": (free, values, jax.tree.map(lambda a: a[first], dqn)),
+            "DQN, no penalty": (free.pmdp.replace(params=told), _values(free), free.weights),
         }
         for method, case in cases.items():
             found.append({"track": track, "method": method, "episodes": _played(*case)})
     return found
 
 
+def _values(agent: rp_jax.Agent) -> Any:
+    """From weights to the action values of a percept."""
+    return functools.partial(evaluation.action_values, agent.network)
+
+
 def _played(pmdp: Any, policy: Any, weights: Any) -> list[dict[str, Any]]:
     """Positions, and whether the wall was hit at each: from the start of the demo, and others."""
-    from experiments import drawing
+    from experiments.figures import shared
 
-    key = tasks.key_of(0, tasks.STARTS)
-    starts = jax.vmap(circuit.reset, (0, None))(jax.random.split(key, EPISODES - 1), pmdp.params)
+    key = jax.random.key(0)
+    keys = jax.random.split(key_of(key, Stream.STARTS), EPISODES - 1)
+    starts = jax.vmap(circuit.reset, (0, None))(keys, pmdp.params)
     demo = circuit.demo_start(pmdp.params)
     starts = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), demo, starts)
-    steps = int(pmdp.params.time_limit)
-    episodes = drawing.recorded(key, pmdp, starts, steps, policy, weights)
+    own, steps = key_of(key, Stream.RECORDING), int(pmdp.params.time_limit)
+    episodes = shared.recorded(own, pmdp, starts, steps, policy, weights)
     return [{"position": e.position.round(4), "hit": e.hit} for e in episodes]
 
 

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 from experiments.paper import published, scores
-from experiments.paper.fig5 import TASKS, line
 from experiments.paper.section import Section, Table
 
 TITLE = "More steps for the others"
@@ -13,7 +12,7 @@ TITLE = "More steps for the others"
 def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
     """A row per task, method and number of steps, over the seeds; RP with its own steps alone."""
     rows = []
-    for env, (runs, _) in TASKS.items():
+    for env, runs in scores.LEARNED.items():
         found = [row for name in runs for row in scores.read(sources(name) / "table.json")]
         few = scores.evaluated(sources, env)
         many = scores.evaluated(lambda name: sources(f"long_{name}"), env)
@@ -26,7 +25,7 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
 
 def tell(results: list[dict[str, Any]]) -> Section:
     """Nothing of it was published."""
-    lines = [{**line(row["env"], row), "steps": row["budget"]} for row in results]
+    lines = [{**scores.line(row["env"], row), "steps": row["budget"]} for row in results]
     return Section(
         "Whether those without a threat function catch up if they may learn for longer; RP's steps "
         "do not count those of the simulators that its threat functions come from.",

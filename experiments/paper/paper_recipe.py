@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 from experiments.paper import published, scores
-from experiments.paper.fig4 import ERRORS, errors
 from experiments.paper.section import Section, Table
 
 TITLE = "The paper's recipe against the tuned one"
@@ -42,7 +41,7 @@ def tell(results: dict[str, Any]) -> Section:
         found = scores.summed_up(of["rows"])
         tables.append(scores.table(env, found, published.SCORES[env]))
         for row in of["reports"]:
-            threats.append({"task": env, "recipe": row["method"], **errors(row)})
+            threats.append({"task": env, "recipe": row["method"], **scores.errors(row)})
         theirs = [row for row in found if row["method"] == PAPER]
         claims += scores.entries(theirs, published.SCORES[env], f"Recipe of appendix G.1, {env}")
         last = [row for row in of["history"] if row["method"] == PAPER][-1]
@@ -50,7 +49,7 @@ def tell(results: dict[str, Any]) -> Section:
     return Section(
         "Networks, threat functions, learner and exploration as the paper has them. Planning by "
         f"the paper's recipe: {'; '.join(lasted)}; the paper: 3M steps, 24 hours on a GPU.",
-        tables=[*tables, Table(ERRORS, threats)],
+        tables=[*tables, Table(scores.ERRORS, threats)],
         claims=claims,
         figures={"learning.png": "Return and crash rate while learning."},
     )

@@ -8,9 +8,9 @@ from typing import Any
 
 from scipy import stats
 
-from experiments import tables
 from experiments.paper import published
 from experiments.paper.section import Claim, Section, Table, holds, verdict_on
+from rp_jax.runs import tables
 
 Row = dict[str, Any]
 RP, LOST, PLANS, AHEAD = "RP", "RP, lost", "RP, plans", "RP, plans, one step ahead"
@@ -19,6 +19,15 @@ RUNS = {  # of each kind of RP
     "jam": {RP: "jam", PLANS: "jam_plans", AHEAD: "jam_ahead"},
     "point_gather": {RP: "point_gather"},
 }
+LEARNED = {  # of RP, on the task that was learned
+    "point_gather": ("point_gather", "point_gather_x01"),
+    "circuit": ("circuit",),
+    "jam": ("jam",),
+}
+SEARCHES = {"point_gather": (1, 2), "circuit": (3, 4, 5), "jam": (2, 3)}  # steps of MPC
+TABLED = {"circuit": 4, "jam": 3}  # steps of MPC in the paper's tables
+KEPT = ("method", "seed", "steps", "episodes", "return_mean", "crashes")  # of learning curves
+ERRORS = "Threat models against fresh labels, and sums on states of the task"
 
 
 def read(path: Path) -> Any:
@@ -45,13 +54,18 @@ def by_kind(sources: Any, runs: Mapping[str, str]) -> list[Row]:
     ]
 
 
-def collect(sources: Any, env: str, searches: Sequence[int]) -> list[Row]:
-    """One row per method, variant and seed: RP, the methods compared with, MPC."""
+def collect(sources: Any, env: str) -> list[Row]:
+    """One row per method, published variant and seed: RP, the methods compared with, MPC."""
     rows = by_kind(sources, RUNS[env])
     rows += evaluated(sources, env)
-    for steps in searches:
-        rows += read(sources(f"mpc_{env}_{steps}") / "table.json")
-    return rows
+    rows += searched(sources, env, [TABLED[env]])
+    return [row for row in rows if row["variant"] in published.SCORES[env]]
+
+
+def searched(sources: Any, env: str, searches: Sequence[int]) -> list[Row]:
+    """One row per number of steps that MPC looks ahead, variant and seed."""
+    folders = [sources(f"mpc_{env}_{steps}") for steps in searches]
+    return [row for folder in folders for row in read(folder / "table.json")]
 
 
 def learners(sources: Any, env: str) -> dict[str, Path]:
@@ -96,6 +110,29 @@ def summed_up(rows: Sequence[Row]) -> list[Row]:
         of = [row for row in rows if row["method"] == method]
         found += [{"method": method, **row} for row in tables.over_seeds(of)]
     return found
+
+
+def line(env: str, row: Row) -> Row:
+    """A line of a table: what a method's agents do on a task after learning."""
+    return {
+        "task": env,
+        "method": row["method"],
+        "seeds": row["seeds"],
+        "return": tables.earned(row),
+        "crashes": tables.crashed(row),
+        "crash rate, % [95 %]": tables.percent(row),
+    }
+
+
+def errors(row: Row) -> Row:
+    """A line of a table: how far a threat model is off, by a row of its report."""
+    return {
+        "hazard": row["hazard"],
+        "of": row["of"],
+        "mean absolute error": f"{row['mae']:.4f}",
+        "bias": f"{row['bias']:+.4f}",
+        "unsafe pairs called safe, %": f"{100 * row['unsafe_called_safe']:.2f}",
+    }
 
 
 def shown(row: Row) -> str:

@@ -3,10 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-from experiments import tables
 from experiments.paper import published, scores
-from experiments.paper.fig5 import KEPT
 from experiments.paper.section import Claim, Section, holds
+from rp_jax.runs import tables
 
 LEARNED_ON = published.LEARNED_ON["jam"]
 TITLE = "A second reward: patrol instead of exit"
@@ -18,7 +17,7 @@ def run(sources: Any, folder: Path) -> dict[str, Any]:
     history = scores.read_lines(patrol / "metrics.jsonl")
     return {
         "rows": scores.read(patrol / "table.json"),
-        "history": [{key: row[key] for key in KEPT} for row in history],
+        "history": [{key: row[key] for key in scores.KEPT} for row in history],
     }
 
 

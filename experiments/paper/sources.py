@@ -8,10 +8,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from experiments import console, settings
 from experiments.paper.commands import words
 from experiments.paper.scores import read
 from rp_jax import storage
+from rp_jax.cli import experiment, terminal
+from rp_jax.runs import record
 
 LOG = "log.json"  # of a run's processes: command, commit, times, how each ended
 ONE_FILE = ("theorems",)  # experiments whose --out is a file
@@ -53,14 +54,14 @@ class Sources:
                 other, _, file = word[1:].partition("/")
                 rest[i] = str(self(other) / file)
         log = read(folder / LOG) if (folder / LOG).exists() else []
-        if resumable(folder) and goes_on(folder, f"experiments.{module}"):
+        if resumable(folder) and goes_on(folder, module):
             rest = ["--resume", str(folder)]
         else:
             shutil.rmtree(folder, ignore_errors=True)
             rest += ["--out", str(folder / "table.json" if module in ONE_FILE else folder)]
             (folder if module in ONE_FILE else folder.parent).mkdir(parents=True, exist_ok=True)
-        command = ["python", "-m", f"experiments.{module}", *rest]
-        console.say(f"{name}: {' '.join(command)}", style="bold")
+        command = [*called(module).split(), *rest]
+        terminal.say(f"{name}: {' '.join(command)}", style="bold")
         entry: dict[str, Any] = {"command": " ".join(command), "commit": commit()}
         ended = timed(command, lock)
         if folder.exists():
@@ -83,22 +84,28 @@ def finished(folder: Path) -> bool:
 
 def resumable(folder: Path) -> bool:
     """There is a run in the folder that `--resume` goes on with."""
-    return _begun(folder) and (folder / settings.CHECKPOINTS).is_dir()
+    return _begun(folder) and (folder / record.CHECKPOINTS).is_dir()
 
 
-def goes_on(folder: Path, experiment: str) -> bool:
+def called(module: str) -> str:
+    """How an experiment is called, which is its name in config.json."""
+    return f"python -m experiments.{module}"
+
+
+def goes_on(folder: Path, module: str) -> bool:
     """Whether the experiment would go on with the run here; says why not."""
+    argv = ["--resume", str(folder)]
     try:
-        settings.interrupted(folder, experiment)
+        experiment.interrupted(folder, called(module), None, argv)
     except ValueError as error:
-        console.say(f"{error}; it begins anew", style="yellow")
+        terminal.say(f"{error}; it begins anew", style="yellow")
         return False
     return True
 
 
 def _begun(folder: Path) -> bool:
     """By an experiment that keeps checkpoints until it is finished."""
-    return (folder / "config.json").exists() and "experiment" in settings.read(folder)
+    return (folder / "config.json").exists() and "experiment" in read(folder / "config.json")
 
 
 def timed(command: list[str], lock: int) -> dict[str, Any]:

@@ -3,17 +3,16 @@
 from pathlib import Path
 from typing import Any
 
-from experiments.paper import published, scores
+from experiments.paper import scores
 from experiments.paper.section import Section
 
 TITLE = "Table 1: Jam among 3, 8 and 15 obstacles"
-ENV, SEARCHES = "jam", (3,)
+ENV = "jam"
 
 
 def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
     """A row per method, number of obstacles and seed."""
-    rows = scores.collect(sources, ENV, SEARCHES)
-    return [row for row in rows if row["variant"] in published.SCORES[ENV]]
+    return scores.collect(sources, ENV)
 
 
 def plot(results: list[dict[str, Any]], folder: Path) -> None:

@@ -7,12 +7,12 @@ from experiments.paper import scores
 from experiments.paper.section import Section
 
 TITLE = "Table 2: Circuit, narrowed, and circle"
-ENV, SEARCHES = "circuit", (4,)
+ENV = "circuit"
 
 
 def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
     """A row per method, track and seed."""
-    return scores.collect(sources, ENV, SEARCHES)
+    return scores.collect(sources, ENV)
 
 
 def plot(results: list[dict[str, Any]], folder: Path) -> None:

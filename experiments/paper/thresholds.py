@@ -5,9 +5,9 @@ from typing import Any
 
 from scipy import stats
 
-from experiments import tables
 from experiments.paper.scores import read
 from experiments.paper.section import Claim, Section, Table, holds
+from rp_jax.runs import tables
 
 LEVEL = 0.05  # of the test that fewer states are without an admissible action as x grows
 TITLE = "The threshold x, without learning the threat again"

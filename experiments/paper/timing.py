@@ -9,23 +9,35 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import console, evaluation, mpc, policy_gradient, runs, tasks
 from experiments.paper import published
-from experiments.paper.fig5 import TASKS
 from experiments.paper.published import LEARNED_ON
-from experiments.paper.scores import AHEAD, PLANS, RP, read
+from experiments.paper.scores import AHEAD, PLANS, RP, SEARCHES, read
 from experiments.paper.section import EXCEEDED, MISSED, Claim, Section, Table, holds
+from rp_jax import recipes
 from rp_jax.baselines import actor_critic
 from rp_jax.baselines.cpo import CPOConfig
 from rp_jax.baselines.mpc import make_search
+from rp_jax.cli import terminal
+from rp_jax.cli.choice import Choice, chosen
 from rp_jax.planning.pmdp import PMDP
+from rp_jax.runs.agents import Agent
+from rp_jax.runs.dataclass_json import restored
+from rp_jax.runs.evaluate import Timing, acting, greedily, timed
+from rp_jax.runs.policy_gradient import by_mode
+from rp_jax.runs.tree_search import time_search
+from rp_jax.streams import Stream, key_of
+from rp_jax.threat.build import ThreatConfig
 
 TITLE = "Computation time"
-SEARCHES = {env: searches for env, (_, searches) in TASKS.items()}
 TIMED = {  # runs of RP
     "circuit": {RP: "circuit_lost", PLANS: "circuit_plans"},
     "jam": {RP: "jam", AHEAD: "jam_ahead"},
     "point_gather": {RP: "point_gather"},
+}
+TUNED = {  # recipes of threat functions, by kind of hazard
+    "wall": recipes.TUNED_WALL,
+    "obstacle": recipes.TUNED_OBSTACLE,
+    "bomb": recipes.TUNED_BOMB,
 }
 ROUNDS = 3
 STEPS = 3_000_000  # that the paper's agents learn in
@@ -36,69 +48,80 @@ def run(sources: Any, folder: Path) -> dict[str, Any]:
     rows, learning = [], []
     for env in SEARCHES:
         folders = {method: sources(name) for method, name in TIMED[env].items()}
-        own = {method: runs.load(folder) for method, folder in folders.items()}
-        learning.append(learned(own[RP], folders[RP]))
-        timers = timers_of(env, own)
-        with console.progress(f"timing, {env}") as bar:
+        own = {
+            method: chosen(Choice(run=made, variant=LEARNED_ON[env])).agents[0]
+            for method, made in folders.items()
+        }
+        facts = read(folders[RP] / "config.json")
+        learning.append(learned(env, facts, read(folders[RP] / "training.json")))
+        timers = timers_of(env, own, facts["config"]["penalty"])
+        with terminal.progress() as bar:
             for i, (method, timer) in enumerate(timers.items()):
-                bar("", i, len(timers), method)
-                seconds = [timer()[0] for _ in range(ROUNDS)]
+                bar(f"timing, {env}", i, len(timers), method)
+                seconds = [timer().wall for _ in range(ROUNDS)]
                 row = {"env": env, "variant": LEARNED_ON[env], "method": method}
                 rows.append({**row, "seconds": seconds})
-            bar("", len(timers), len(timers))
+            bar(f"timing, {env}", len(timers), len(timers), "")
     return {"actions": rows, "learning": learning}
 
 
-def learned(run: runs.Run, folder: Path) -> dict[str, Any]:
+def learned(env: str, facts: dict[str, Any], trained: dict[str, Any]) -> dict[str, Any]:
     """How long reconnaissance and planning of a run took.
 
     `whole` if that is all of it: with the recipe's labels, and not interrupted.
+
+    Args:
+        env: the task.
+        facts: the run's config.json.
+        trained: its training.json.
     """
-    trained = read(folder / "training.json")
-    module = runs.EXPERIMENTS[run.task.name]
+    threats = {
+        kind: restored(ThreatConfig, plain, f"config.json: {kind}")
+        for kind, plain in facts["threats"].items()
+    }
+    by_recipe = threats == {kind: TUNED[kind] for kind in threats}
+    again = facts["process"]["threat"] is not None
     return {
-        "env": run.task.name,
-        "seeds": run.config.seeds,
+        "env": env,
+        "seeds": facts["config"]["seeds"],
         "steps": trained["steps"],
-        "whole": run.task.threats == module.make_task(module.full("tuned")).threats
-        and not trained.get("resumed", False),
+        "whole": by_recipe and not again and not trained.get("resumed", False),
         **trained["seconds"],
     }
 
 
-def timers_of(env: str, own: dict[str, runs.Run]) -> dict[str, Callable[[], tuple[float, float]]]:
-    """By method, what plays 100 actions and says how long they took: (wall, CPU) time.
+def timers_of(env: str, own: dict[str, Agent], penalty: float) -> dict[str, Callable[[], Timing]]:
+    """By method, what plays 100 actions and says how long they took.
 
     The time of a network does not depend on what it has learned, so DQN has RP's weights and CPO
     none of its own. PID-Lagrangian acts as CPO does.
 
     Args:
         env: the task.
-        own: runs of RP, by kind.
+        own: agents of RP, by kind, in the test that is timed.
+        penalty: per unit of danger, in the tables.
     """
-    key = tasks.key_of(0, tasks.EVALUATION)
-    found: dict[str, Callable[[], tuple[float, float]]] = {}
+    key = jax.random.key(0)
+    found: dict[str, Callable[[], Timing]] = {}
 
     def add(method: str, pmdp: PMDP, policy: Any, weights: Any) -> None:
-        act = evaluation.acting(pmdp, policy, weights)
-        time = evaluation.action_seconds
-        found[method] = functools.partial(time, key, pmdp.env, pmdp.params, act)
+        act, own = acting(pmdp, policy, weights), key_of(key, Stream.TIMING)
+        found[method] = functools.partial(timed, own, pmdp.env, pmdp.params, act)
 
-    for method, loaded in own.items():
-        subject = loaded.subject(LEARNED_ON[env], 0)
-        add(method, subject.pmdp, evaluation.greedily(subject.network), subject.weights)
-    subject = own[RP].subject(LEARNED_ON[env], 0)
-    free = subject.pmdp.replace(threats=None, x=jnp.asarray(jnp.inf))
-    add("DQN", free, evaluation.greedily(subject.network), subject.weights)
+    for method, agent in own.items():
+        add(method, agent.pmdp, greedily(agent.network), agent.weights)
+    agent = own[RP]
+    free = agent.pmdp.replace(threats={}, shielded=False, x=jnp.asarray(jnp.inf))
+    add("DQN", free, greedily(agent.network), agent.weights)
     actor: Any = actor_critic.make_actor(free, CPOConfig().rollout)
     start = jax.vmap(free.env.reset, (0, None))(jax.random.split(key, 1), free.params)
     weights = actor.init(key, free.perceive(start).encoded)
-    add("CPO", free, policy_gradient.modes(CPOConfig(), free), weights)
+    add("CPO", free, by_mode(CPOConfig(), free), weights)
     model: Any = free.env
-    avoided = mpc.AVOIDED.get(env, own[RP].config.penalty)
+    avoided = published.AVOIDED.get(env, penalty)
     for steps in SEARCHES[env]:
         search = make_search(model, free.params, steps, avoided)
-        found[f"MPC ({steps} steps)"] = functools.partial(mpc.action_seconds, key, search)
+        found[f"MPC ({steps} steps)"] = functools.partial(time_search, key, search)
     return found
 
 

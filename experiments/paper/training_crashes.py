@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Any
 
-from experiments import tables
 from experiments.paper import published, scores
 from experiments.paper.section import Claim, Section, Table, holds
 from rp_jax import statistics
+from rp_jax.runs import tables
 
 TITLE = "Crashes while learning"
 ALSO = {"point_gather": {"RP, x = .1": "point_gather_x01"}}  # kinds of RP, beside those of tables

@@ -10,12 +10,14 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from experiments import console, runs, tasks
 from experiments.paper.section import Section, Table
-from rp_jax import evaluate
-from rp_jax.envs.base import Hazards
+from rp_jax import recording
+from rp_jax.cli import terminal
+from rp_jax.cli.choice import Choice, chosen
+from rp_jax.envs.contract import Hazards
 from rp_jax.hazards import SubRMDP, WallPoint
 from rp_jax.recon import labels
+from rp_jax.streams import Stream, key_of
 from rp_jax.threat import report
 from rp_jax.threat.total import total_threat
 
@@ -35,9 +37,9 @@ class Walls(struct.PyTreeNode):
         """Of a wall point."""
         return self.wall.horizon
 
-    def hits(self, agent: Any, points: Hazards) -> Array:
+    def hits(self, body: Any, points: Hazards) -> Array:
         """Any of them is."""
-        return jnp.any(jax.vmap(self.wall.hits, (None, 0))(agent, points.state) & points.present)
+        return jnp.any(jax.vmap(self.wall.hits, (None, 0))(body, points.state) & points.present)
 
 
 def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
@@ -47,34 +49,31 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
     """
     rows = []
     for env, name in RUNS.items():
-        loaded = runs.load(sources(name))
-        pmdp = loaded.pmdp(next(iter(loaded.task.tests)))
-        key = tasks.key_of(loaded.config.seed, tasks.SUMS)
-        states = jax.jit(evaluate.visited_states, static_argnums=2)(key, pmdp, STATES)
+        agents = chosen(Choice(run=sources(name))).agents
+        pmdp, member = agents[0].pmdp, agents.members[0]
+        key = key_of(jax.random.key(member.seed), Stream.SUMS)
+        states = jax.jit(recording.visited_states, static_argnums=2)(key, pmdp, STATES)
         points = jax.jit(jax.vmap(pmdp.env.hazards, (0, None)))(states, pmdp.params)["wall"]
         sub = pmdp.env.sub_rmdps(pmdp.params)["wall"]
-        with console.progress(f"walls, {env}") as bar:
-            bar("", 0, 1)
-            joint, summed = exact(key, states.agent, points, sub)
-            bar("", 1, 1)
-        assert pmdp.threats is not None
-        said = total_threat({"wall": pmdp.threats["wall"]}, states.agent, {"wall": points})
+        with terminal.progress() as bar:
+            bar(f"walls, {env}", 0, 1, "")
+            joint, summed = exact(key, states.body, points, sub)
+            bar(f"walls, {env}", 1, 1, "")
+        said = total_threat({"wall": pmdp.threats["wall"]}, states.body, {"wall": points})
         kinds = {"joint, exact": joint, "sum, exact": summed, "sum, models": said}
-        for name, threat in kinds.items():
-            rows.append(
-                {"env": env, "of": name, "x": loaded.config.x}
-                | compared(np.asarray(threat), joint, loaded.config.x)
-            )
+        for kind, threat in kinds.items():
+            admitted = compared(np.asarray(threat), joint, member.x)
+            rows.append({"env": env, "of": kind, "x": member.x, **admitted})
     return rows
 
 
-def exact(key: Array, agents: Any, points: Hazards, sub: SubRMDP) -> tuple[np.ndarray, np.ndarray]:
+def exact(key: Array, bodies: Any, points: Hazards, sub: SubRMDP) -> tuple[np.ndarray, np.ndarray]:
     """(joint, summed) threats (B, A) of the wall points near agents (B, ...)."""
     walls: Any = Walls(wall=sub.source)
     both = sub.replace(source=walls)
     count = points.present.shape[0]
-    joint = labels.label(key, agents, points, both, labels.exact_threat, rows=count)
-    summed = report.labelled_sum(key, agents, points, sub, labels.exact_threat)
+    joint = labels.label(key, bodies, points, both, labels.exact_threat, rows=count)
+    summed = report.labelled_sum(key, bodies, points, sub, labels.exact_threat)
     return np.asarray(joint.threat), summed
 
 

@@ -1,1 +1,1 @@
-"""Environments and shield for other libraries; each module is the only importer of its library."""
+"""Adapters to other libraries: environments, and the shield; only they import these libraries."""

@@ -1,4 +1,4 @@
-"""Environments as brax's, fresh resets for brax's own, and the shield for any of them.
+"""Environments for brax, new starts after each episode, and the shield for any brax environment.
 
 Importing this module registers every environment: `brax.envs.get_environment("rp_jax_jam")`.
 """
@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rp_jax import shield
+from rp_jax import arrays, shield
 from rp_jax.adapters import registry
 from rp_jax.adapters.quiet import quietly
-from rp_jax.envs import base
+from rp_jax.envs import contract, optional
 from rp_jax.validate import number
 
 with quietly():
@@ -25,50 +25,54 @@ with quietly():
 
 
 def _typed(key: Array) -> Array:
-    """brax hands out raw keys; ours are typed."""
+    """Returns a key in the typed form that this library uses; brax hands out raw keys."""
     return key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(key)
 
 
 def _split(keys: Array) -> tuple[Array, Array]:
-    """Two raw keys from one, or from each of a batch; what a state carries must be raw."""
+    """Returns two raw keys from one, or from each of a batch; keys inside a state must be raw."""
     split = jax.random.split if _typed(keys).ndim == 0 else jax.vmap(jax.random.split)
     pair = jax.random.key_data(split(_typed(keys)))
     return pair[..., 0, :], pair[..., 1, :]
 
 
 class BraxEnv(Env):
-    """One of our environments, unbatched.
+    """One of this library's environments as a brax environment, unbatched.
 
-    `pipeline_state` is the environment's own state. `done` is 1 at a true end only: as in all of
-    brax, the time limit is the wrappers' (`wrap` sets it); `info["truncation"]` tells of it here.
-    Danger is `info["cost"]`, and in `metrics`.
+    `pipeline_state` is the environment's own state. `done` is 1 only in terminal states: as
+    everywhere in brax, the time limit is left to wrappers (`wrap` sets it), and
+    `info["truncation"]` reports it. Danger is `info["cost"]`, and in `metrics`.
     """
 
-    def __init__(self, env: base.Env, params: Any):
+    def __init__(self, env: contract.Env, params: Any):
         self.env, self.params = env, params
 
     @property
     def observation_size(self) -> int:
-        """Length of an observation."""
-        return self.env.LIDAR_BINS + len(self.env.SCALE)
+        """The length of an observation."""
+        return optional.observation_size(self.env, self.params)
 
     @property
     def action_size(self) -> int:
-        """2: acceleration and turn, as shares in [-1, 1] of the strongest."""
+        """The size of a continuous action, 2: acceleration and turn, each in [-1, 1]."""
         return 2
 
     @property
     def backend(self) -> str:
-        """None of brax's."""
+        """The name of the physics backend, "rp_jax", since none of brax's is used."""
         return "rp_jax"
 
     @property
     def time_limit(self) -> int:
-        """Steps of an episode."""
+        """The number of steps of an episode."""
         return int(self.params.time_limit)
 
     def reset(self, rng: Array) -> State:
-        """A fresh start. `rng` is a typed key or a raw one."""
+        """Returns a new start.
+
+        Args:
+            rng: random key, typed or raw.
+        """
         start, key = _split(rng)
         state = self.env.reset(_typed(start), self.params)
         zero, no = jnp.zeros(()), jnp.zeros((), jnp.float32)
@@ -82,11 +86,14 @@ class BraxEnv(Env):
         )
 
     def step(self, state: State, action: Array) -> State:
-        """One transition: the environment's `step` under a key that the state carries.
+        """Makes one transition, under a random key that the state carries.
 
         Args:
-            state: of `reset` or `step`.
-            action: () int, one of the discrete actions; or (2,) float, cut to [-1, 1].
+            state: a state from `reset` or `step`.
+            action: () int, one of the discrete actions; or (2,) float, clipped to [-1, 1].
+
+        Returns:
+            The state after.
 
         Raises:
             ValueError: the action has another shape or type.
@@ -107,6 +114,7 @@ class BraxEnv(Env):
 
 
 def _checked(action: Any) -> Array:
+    """Returns an action as an array; raises ValueError unless it is an integer or 2 floats."""
     action = jnp.asarray(action)
     discrete = action.shape == () and jnp.issubdtype(action.dtype, jnp.integer)
     continuous = action.shape == (2,) and jnp.issubdtype(action.dtype, jnp.floating)
@@ -118,20 +126,34 @@ def _checked(action: Any) -> Array:
 
 
 class FreshResets(Wrapper):
-    """Begins anew, from a start drawn anew, wherever an episode of a batch has ended.
+    """A wrapper that draws a new start wherever an episode of a batch has ended.
 
-    For any brax environment that takes a batch of keys; brax's AutoResetWrapper returns to the
-    first start for ever. The observation that an episode ended with is `info["final_obs"]`.
+    It works for any brax environment that takes a batch of keys; brax's AutoResetWrapper always
+    returns to the first start. `info["final_obs"]` is the observation that the last step led to,
+    terminal ones included.
     """
 
     def reset(self, rng: Array) -> State:
-        """Starts; `rng` has a leading axis (B,)."""
+        """Returns new starts.
+
+        Args:
+            rng: (B,) random keys.
+        """
         start, key = _split(rng)
         state = self.env.reset(start)
         return state.replace(info=state.info | {"reset_key": key, "final_obs": state.obs})
 
     def step(self, state: State, action: Array) -> State:
-        """One transition of all; `done` and `info` tell of the step, `obs` of what follows."""
+        """Makes one transition of the batch.
+
+        Args:
+            state: states, leading axis (B,).
+            action: (B, ...) actions.
+
+        Returns:
+            States whose `done` and `info` belong to the step, and whose `obs` is that of the states
+            to continue from, new starts included.
+        """
         now, later = _split(state.info["reset_key"])
         info = dict(state.info)
         if "steps" in info:
@@ -143,7 +165,7 @@ class FreshResets(Wrapper):
             return fresh.pipeline_state, fresh.obs
 
         seen = reached.pipeline_state, reached.obs
-        pipeline_state, obs = base.renew(reached.done > 0, seen, starts)
+        pipeline_state, obs = arrays.renew(reached.done > 0, seen, starts)
         info = reached.info | {"reset_key": later, "final_obs": reached.obs}
         return reached.replace(pipeline_state=pipeline_state, obs=obs, info=info)
 
@@ -154,16 +176,20 @@ def wrap(
     action_repeat: int = 1,
     randomization_fn: Callable | None = None,
 ) -> Wrapper:
-    """For brax's agents, as `wrap_env_fn`: batches, time limits that are no ends, fresh resets.
+    """Wraps an environment for brax's agents, as their `wrap_env_fn`.
+
+    It adds a batch axis, a time limit that is not a terminal state, and new starts after each
+    episode.
 
     Args:
-        env: unbatched.
-        episode_length: steps; a time limit of the environment's own counts where it is shorter.
-        action_repeat: 1; a crash inside a repeated action would not be seen.
-        randomization_fn: not supported.
+        env: an unbatched environment.
+        episode_length: number of steps; the environment's own time limit counts where it is
+            shorter.
+        action_repeat: must be 1; a crash inside a repeated action would be missed.
+        randomization_fn: must be None; vary the environment's parameters instead.
 
     Raises:
-        ValueError: `randomization_fn` is given, or `action_repeat` is not 1.
+        ValueError: `randomization_fn` is not None, or `action_repeat` is not 1.
     """
     number("action_repeat", action_repeat, least=1, most=1, integer=True)
     if randomization_fn is not None:
@@ -173,11 +199,11 @@ def wrap(
 
 
 class Shielded(Wrapper):
-    """Lets no inadmissible action through where there is an admissible one, whatever the policy.
+    """A wrapper that replaces inadmissible actions by admissible ones, whatever the policy.
 
-    For any brax environment, batched or not. `info` and `metrics` tell of each step whether the
-    policy's choice was replaced ("intervention") and whether no action was admissible
-    ("insecure"); then the least threatening one is taken.
+    It works for any brax environment, batched or not. `info` and `metrics` report for each step
+    whether the policy's choice was replaced ("intervention"), and whether no action was admissible
+    ("insecure"), in which case the least threatening one is taken.
     """
 
     def __init__(
@@ -187,32 +213,39 @@ class Shielded(Wrapper):
         x: Array | float,
         table: Array | None = None,
     ):
-        """The threat is asked before every step.
+        """Wraps an environment with a shield, which asks for the threats before every step.
 
         Args:
-            env: takes () int actions, or with a table (D,) floats.
-            threat: maps a state to the threats (A,) of its actions; with leading axes where `env`
+            env: the environment; it takes () int actions, or with a table (D,) floats.
+            threat: maps a state to the threats (A,) of its actions, with leading axes where `env`
                 is batched.
-            x: largest admissible threat; infinity lets everything pass.
-            table: (A, D) the actions that threats are given for, where they are continuous.
+            x: greatest admissible threat; infinity lets every action pass.
+            table: (A, D) the continuous actions that the threats belong to.
         """
         super().__init__(env)
         self.threat, self.x, self.table = threat, x, table
 
     def reset(self, rng: Array) -> State:
-        """As without a shield."""
+        """Returns a start of the wrapped environment.
+
+        Args:
+            rng: random key or keys, as the wrapped environment takes them.
+        """
         state = self.env.reset(rng)
         none = jnp.zeros_like(state.done)
         return _tell(state, {"intervention": none, "insecure": none})
 
     def step(self, state: State, action: Array) -> State:
-        """One transition under the nearest thing to `action` that is admissible.
+        """Makes one transition under the admissible action that comes closest to the given one.
 
         Args:
-            state: of `reset` or `step`.
-            action: () int, whose substitute is the least threatening action; or (A,) floats, the
-                policy's scores, whose substitute is its next best; or with a table (D,) floats,
-                taken for the nearest row, whose substitute is the nearest that is admissible.
+            state: a state from `reset` or `step`.
+            action: () int, replaced by the least threatening action; or (A,) floats, scores of all
+                actions, replaced by the best admissible one; or with a table (D,) floats, a
+                continuous action, replaced by the nearest admissible row.
+
+        Returns:
+            The state after.
         """
         threat = self.threat(state)
         function = functools.partial(shield.correct, x=self.x, table=self.table)
@@ -226,24 +259,27 @@ class Shielded(Wrapper):
 
 
 def _tell(state: State, told: dict[str, Array]) -> State:
+    """Returns a state with entries added to its `info` and `metrics`."""
     return state.replace(info=state.info | told, metrics=state.metrics | told)
 
 
 def _device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
-    """A copy of every array on each device, along a new leading axis."""
+    """Returns a copy of every array on each device, along a new leading axis."""
     mesh = jax.sharding.Mesh(np.asarray(devices), ("device",))
     sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("device"))
     copies = lambda a: jnp.broadcast_to(a, (len(devices), *jnp.shape(a)))  # noqa: E731
     return jax.tree.map(lambda a: jax.device_put(copies(a), sharding), tree)
 
 
-# brax 0.14.2's PPO and SAC call what jax 0.10 took away (https://github.com/google/brax/issues/671).
-# brax's development version no longer does; this goes with the release that follows.
+# The PPO and SAC of brax 0.14.2 call a function that jax 0.10 removed
+# (https://github.com/google/brax/issues/671). The development version of brax no longer does; this
+# can be removed after its next release.
 if not hasattr(jax, "device_put_replicated"):
     jax.device_put_replicated = _device_put_replicated  # type: ignore[assignment]
 
 
 def _maker(name: str) -> Callable[..., BraxEnv]:
+    """Returns the function from settings to an environment that brax registers."""
     return lambda **settings: BraxEnv(*registry.make(name, **settings))
 
 

@@ -1,4 +1,4 @@
-"""Environments as gymnasium's, singly and by the batch, and the shield for any of its own.
+"""Environments for gymnasium, single and batched, and the shield for any gymnasium environment.
 
 Importing this module registers every environment: `gymnasium.make("rp_jax/Jam-v0")`, and
 `gymnasium.make_vec("rp_jax/Jam-v0", num_envs=1024)` for a batch in one compiled program.
@@ -14,7 +14,8 @@ import numpy as np
 
 from rp_jax import shield
 from rp_jax.adapters import registry
-from rp_jax.envs import base
+from rp_jax.envs import autoreset, optional
+from rp_jax.envs.contract import Env as JaxEnv
 from rp_jax.validate import number, positive
 
 try:
@@ -26,23 +27,31 @@ except ImportError as error:
         "rp_jax.adapters.gymnasium needs gymnasium 1.1 or newer (pip install 'rp_jax[gymnasium]')"
     ) from error
 
-FARTHEST = 100.0  # bound of what is observed beside the LIDAR; gymnasium wants a finite one
+FARTHEST = 100.0  # bound of observations beside the LIDAR; gymnasium wants a finite one
 
 
-def _spaces(env: base.Env, params: Any) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Discrete]:
-    """Of observations and actions; a LIDAR sees shares in [0, 1] of its range."""
-    sizes = env.LIDAR_BINS, len(env.SCALE)
+def _spaces(env: JaxEnv, params: Any) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Discrete]:
+    """Returns the spaces of observations and actions; LIDAR values are in [0, 1]."""
+    bins = optional.lidar_bins(env)
+    sizes = bins, optional.observation_size(env, params) - bins
     low, high = (
         np.repeat(np.asarray(ends, np.float32), sizes) for ends in ((0, -FARTHEST), (1, FARTHEST))
     )
-    return gymnasium.spaces.Box(low, high), gymnasium.spaces.Discrete(env.num_actions(params))
+    return gymnasium.spaces.Box(low, high), gymnasium.spaces.Discrete(
+        optional.num_actions(env, params)
+    )
 
 
 def _checked(action: Any, shape: tuple[int, ...], count: int) -> np.ndarray:
-    """The action(s) as int32.
+    """Returns an action, or a batch of them, as int32.
+
+    Args:
+        action: what the user gave.
+        shape: shape that it must have.
+        count: number of actions.
 
     Raises:
-        ValueError: not of this shape, not integers, or not in [0, count).
+        ValueError: the shape differs, or a value is not an integer in [0, count).
     """
     given = np.asarray(action)
     if given.shape != shape or not np.issubdtype(given.dtype, np.integer):
@@ -58,51 +67,64 @@ def _checked(action: Any, shape: tuple[int, ...], count: int) -> np.ndarray:
 
 
 def _key(env: Any) -> jax.Array:
-    """From gymnasium's own source of randomness, which a seed has been given to."""
+    """Draws a random key from gymnasium's own generator, which a seed may have been given to."""
     return jax.random.key(int(env.np_random.integers(2**31)))
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _start(env: base.Env, key: jax.Array, params: Any) -> tuple:
-    """(key to go on with, state, observation)."""
+def _start(env: JaxEnv, key: jax.Array, params: Any) -> tuple:
+    """Returns the next key, a new start, and its observation."""
     key, now = jax.random.split(key)
     state = env.reset(now, params)
     return key, state, env.observe(state, params)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _advance(env: base.Env, key: jax.Array, state: Any, action: Any, params: Any) -> tuple:
-    """(key to go on with, state, observation, outcome)."""
+def _advance(env: JaxEnv, key: jax.Array, state: Any, action: Any, params: Any) -> tuple:
+    """Returns the next key, the state after a step, its observation, and the outcome."""
     key, now = jax.random.split(key)
     reached, outcome = env.step(now, state, action, params)
     return key, reached, env.observe(reached, params), outcome
 
 
 @functools.partial(jax.jit, static_argnums=(0, 2))
-def _start_all(env: base.Env, key: jax.Array, count: int, params: Any) -> tuple:
-    """`_start` with a leading axis (count,)."""
+def _start_all(env: JaxEnv, key: jax.Array, count: int, params: Any) -> tuple:
+    """Returns the next key, new starts (count,), and their observations."""
     key, now = jax.random.split(key)
     states = jax.vmap(env.reset, (0, None))(jax.random.split(now, count), params)
     return key, states, jax.vmap(env.observe, (0, None))(states, params)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _advance_all(env: base.Env, key: jax.Array, states: Any, actions: Any, params: Any) -> tuple:
-    """(key to go on with, states and observations to go on from, those reached, outcomes)."""
+def _advance_all(env: JaxEnv, key: jax.Array, states: Any, actions: Any, params: Any) -> tuple:
+    """Makes a step of a batch.
+
+    Returns:
+        The next key; the states to continue from and their observations, new starts included; the
+        observations that the step led to, terminal ones included; and the outcomes.
+    """
     key, now = jax.random.split(key)
     keys = jax.random.split(now, len(actions))
     look = lambda states: jax.vmap(env.observe, (0, None))(states, params)  # noqa: E731
-    carried, reached, outcome = base.step_and_renew(env, keys, states, actions, params, look)
+    carried, reached, outcome = autoreset.step_and_renew(env, keys, states, actions, params, look)
     return key, *carried, reached[1], outcome
 
 
 class Env(gymnasium.Env[np.ndarray, np.int64]):
-    """One environment; `state` is its true state, `info["cost"]` the danger of the step."""
+    """A single environment with its state in `state` and the danger of a step in `info["cost"]`."""
 
     metadata = {"render_modes": []}  # noqa: RUF012 (gymnasium's way)
 
     def __init__(self, name: str, **settings: Any):
-        """Of a registered name, with the settings of its `make_params`."""
+        """Makes an environment from its registered name.
+
+        Args:
+            name: a name in `registry.ENVS`.
+            **settings: settings of the environment's `make_params`.
+
+        Raises:
+            ValueError: the name is not registered, or a setting is out of range.
+        """
         self.env, self.params = registry.make(name, **settings)
         self.observation_space, self.action_space = _spaces(self.env, self.params)
         self.state: Any = None
@@ -110,20 +132,35 @@ class Env(gymnasium.Env[np.ndarray, np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """A start drawn anew; `seed` makes it and all that follow repeatable."""
+        """Draws a new start.
+
+        Args:
+            seed: makes this start and all that follows reproducible.
+            options: not used.
+
+        Returns:
+            The observation, and an empty table.
+        """
         super().reset(seed=seed)
         self._key, self.state, seen = _start(self.env, _key(self), self.params)
         return np.array(seen), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One transition.
+        """Makes one transition.
+
+        Args:
+            action: an integer.
+
+        Returns:
+            The observation, the reward, whether the episode was terminated, whether it was
+            truncated, and a table with "cost" (the danger) and "goal".
 
         Raises:
-            ValueError: the action is no integer, or out of range.
-            gymnasium.error.ResetNeeded: before the first `reset`.
+            ValueError: the action is not an integer, or out of range.
+            gymnasium.error.ResetNeeded: `reset` was never called.
         """
         _reset_first(self.state)
-        taken = _checked(action, (), self.env.num_actions(self.params))
+        taken = _checked(action, (), optional.num_actions(self.env, self.params))
         self._key, self.state, seen, outcome = _advance(
             self.env, self._key, self.state, taken, self.params
         )
@@ -133,16 +170,25 @@ class Env(gymnasium.Env[np.ndarray, np.int64]):
 
 
 class JaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """A batch in one compiled program; a start is drawn anew in the step that ends an episode.
+    """A batch of environments in one program, with new starts in the step that ends an episode.
 
-    What the step itself led to is in `info`: "cost" and "goal" of every row, and of rows that
-    ended the observation "final_obs" and once more cost and goal as "final_info".
+    `info` describes what the step itself led to: "cost" and "goal" of every row, and for rows whose
+    episode ended the last observation as "final_obs", and cost and goal again as "final_info".
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     def __init__(self, name: str, num_envs: int = 1, **settings: Any):
-        """Of a registered name, with the settings of its `make_params`."""
+        """Makes a batch of environments from their registered name.
+
+        Args:
+            name: a name in `registry.ENVS`.
+            num_envs: number of environments.
+            **settings: settings of the environment's `make_params`.
+
+        Raises:
+            ValueError: the name is not registered, or a setting is out of range.
+        """
         self.num_envs = int(positive("num_envs", num_envs, integer=True))
         self.env, self.params = registry.make(name, **settings)
         self.single_observation_space, self.single_action_space = _spaces(self.env, self.params)
@@ -153,7 +199,15 @@ class JaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts drawn anew; `seed` makes them and all that follow repeatable."""
+        """Draws new starts.
+
+        Args:
+            seed: makes these starts and all that follows reproducible.
+            options: not used.
+
+        Returns:
+            The observations (num_envs, n), and an empty table.
+        """
         super().reset(seed=seed)
         self._key, self.states, seen = _start_all(self.env, _key(self), self.num_envs, self.params)
         return np.array(seen), {}
@@ -161,14 +215,22 @@ class JaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def step(
         self, actions: Any
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One transition of every row.
+        """Makes one transition of every environment.
+
+        Args:
+            actions: (num_envs,) integers.
+
+        Returns:
+            The observations to continue from (num_envs, n), new starts included; the rewards,
+            whether each episode was terminated, whether it was truncated, (num_envs,) each; and a
+            table.
 
         Raises:
-            ValueError: the actions are no integers (num_envs,), or out of range.
-            gymnasium.error.ResetNeeded: before the first `reset`.
+            ValueError: the actions are not integers (num_envs,), or out of range.
+            gymnasium.error.ResetNeeded: `reset` was never called.
         """
         _reset_first(self.states)
-        taken = _checked(actions, (self.num_envs,), self.env.num_actions(self.params))
+        taken = _checked(actions, (self.num_envs,), optional.num_actions(self.env, self.params))
         self._key, self.states, seen, last, outcome = _advance_all(
             self.env, self._key, self.states, taken, self.params
         )
@@ -183,12 +245,13 @@ class JaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
 
 def _reset_first(state: Any) -> None:
+    """Raises ResetNeeded if there is no state yet."""
     if state is None:
         raise gymnasium.error.ResetNeeded("step is called before reset")
 
 
 def _final(last: np.ndarray, costs: dict[str, np.ndarray], done: np.ndarray) -> dict[str, Any]:
-    """What gymnasium keeps of episodes that ended, next to a mask of the rows it is of."""
+    """Returns the entries of `info` for episodes that ended, each with a mask of their rows."""
     observations = np.full(len(done), None, object)
     for row in np.flatnonzero(done):
         observations[row] = last[row].copy()
@@ -199,11 +262,11 @@ def _final(last: np.ndarray, costs: dict[str, np.ndarray], done: np.ndarray) -> 
 
 
 class Shielded(gymnasium.Wrapper):
-    """Lets no inadmissible action through where there is an admissible one, whatever the policy.
+    """A wrapper that replaces inadmissible actions by admissible ones, whatever the policy.
 
-    For any gymnasium environment. `info` tells of each step whether the policy's choice was
-    replaced ("intervention") and whether no action was admissible ("insecure"); then the least
-    threatening one is taken.
+    It works for any gymnasium environment. `info` reports for each step whether the policy's choice
+    was replaced ("intervention"), and whether no action was admissible ("insecure"), in which case
+    the least threatening one is taken.
     """
 
     def __init__(
@@ -214,14 +277,16 @@ class Shielded(gymnasium.Wrapper):
         table: np.ndarray | None = None,
         state: Callable[[Any], Any] | None = None,
     ):
-        """The threat is asked before every step.
+        """Wraps an environment with a shield, which asks for the threats before every step.
 
         Args:
-            env: with Discrete actions that begin at 0, or with a table Box actions (D,).
+            env: the environment; it has Discrete actions from 0 on, or with a table Box actions
+                (D,).
             threat: maps a state to the threats (A,) of its actions.
-            x: largest admissible threat; infinity lets everything pass.
-            table: (A, D) the actions that threats are given for, where they are continuous.
-            state: finds the state in the unwrapped environment; else it is the last observation.
+            x: greatest admissible threat; infinity lets every action pass.
+            table: (A, D) the continuous actions that the threats belong to.
+            state: finds the state in the unwrapped environment; by default the state is the last
+                observation.
 
         Raises:
             ValueError: the actions are not discrete and there is no table.
@@ -243,21 +308,33 @@ class Shielded(gymnasium.Wrapper):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """As without a shield."""
+        """Resets the wrapped environment.
+
+        Args:
+            seed: passed on to the wrapped environment.
+            options: passed on to the wrapped environment.
+
+        Returns:
+            The observation, and the wrapped environment's table.
+        """
         self._seen, info = self.env.reset(seed=seed, options=options)
         return self._seen, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """One transition under the nearest thing to `action` that is admissible.
+        """Makes one transition under the admissible action that comes closest to the given one.
 
         Args:
-            action: an integer, whose substitute is the least threatening action; or (A,) floats,
-                the policy's scores, whose substitute is its next best; or with a table (D,)
-                floats, taken for the nearest row, whose substitute is the nearest admissible one.
+            action: an integer, replaced by the least threatening action; or (A,) floats, scores of
+                all actions, replaced by the best admissible one; or with a table (D,) floats, a
+                continuous action, replaced by the nearest admissible row.
+
+        Returns:
+            What the wrapped environment's `step` returns, with "intervention" and "insecure" in the
+            table.
 
         Raises:
             FloatingPointError: all threats are nan, or a number of the action is.
-            ValueError: there is no threat for each action, or the action is none.
+            ValueError: there is not one threat for each action, or the action is not one of these.
         """
         state = self._seen if self._find is None else self._find(self.env.unwrapped)
         threat, wish = np.asarray(self._threat(state)), np.asarray(action)

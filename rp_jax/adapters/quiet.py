@@ -1,4 +1,4 @@
-"""Imports of a library that is noisy about it."""
+"""Imports of libraries that print and warn while they are imported."""
 
 import contextlib
 import io
@@ -8,10 +8,10 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def quietly() -> Iterator[None]:
-    """For brax: it prints which of its engines are missing, and warns of its and others' age.
+    """Silences the prints and warnings of brax, about missing engines and old versions.
 
     Raises:
-        ImportError: what is imported inside is not there; the message says what to install.
+        ImportError: a module imported inside is missing; the message says what to install.
     """
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -3,14 +3,18 @@
 from typing import Any
 
 from rp_jax.envs import circuit, jam, point_gather
-from rp_jax.envs.base import Env
+from rp_jax.envs.contract import Env
 from rp_jax.validate import one_of
 
 ENVS: dict[str, Any] = {"circuit": circuit, "jam": jam, "point_gather": point_gather}
 
 
 def make(name: str, **settings: Any) -> tuple[Env, Any]:
-    """The environment and its parameters, from the settings of its `make_params`.
+    """Returns an environment and its parameters.
+
+    Args:
+        name: a name in `ENVS`.
+        **settings: settings of the environment's `make_params`.
 
     Raises:
         ValueError: there is no such environment, or a setting is out of range.

@@ -1,1 +1,1 @@
-"""Methods the paper compares with."""
+"""Methods to compare with: constrained policy gradients, and model predictive control."""

@@ -1,7 +1,7 @@
-"""What on-policy learners share: rollouts, advantages of reward and of danger, the critic.
+"""Rollouts, advantages and the critic of on-policy learners, for reward and for danger.
 
-Both are of an episode, as limits and tables are: an end by the time limit is an end like any other,
-and the critic is told the time. The policy is not.
+Both signals belong to an episode, as limits and tables do: the end by the time limit counts as an
+end like any other, and the critic (but not the policy) observes the time.
 """
 
 from collections.abc import Callable
@@ -16,27 +16,28 @@ from flax import linen as nn
 from jax import Array
 
 from rp_jax.baselines.policies import ACTORS, Critic
-from rp_jax.envs import base
-from rp_jax.planning.pmdp import PMDP, Encoded, Percept, faults
+from rp_jax.envs import autoreset, optional, tally
+from rp_jax.planning.percept import Encoded, Percept, faults
+from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import number, one_of
 
-REWARD, DANGER = range(2)  # places of the two signals
+REWARD, DANGER = range(2)  # indices of the two signals
 
 
 @dataclass(frozen=True)
 class ActorCriticConfig:
-    """Sizes of the batches, and how they are turned into advantages."""
+    """Sizes of the batches, and settings for the advantages and the critic."""
 
     policy: str = "gaussian"  # or "categorical", over the environment's discrete actions
-    num_envs: int = 64
+    num_envs: int = 64  # number of environments side by side
     length: int = 64  # steps of each environment in a batch
     gamma: float = 0.995  # discount of reward
     beta: float = 1.0  # discount of danger in its advantages
     trace: float = 0.95  # lambda of generalised advantage estimation
-    critic_rate: float = 1e-3
+    critic_rate: float = 1e-3  # learning rate of the critic
     epochs: int = 10  # passes over a batch
-    minibatches: int = 16  # of each pass
-    memory: float = 0.8  # weight of the batches before, where danger is held against a limit
+    minibatches: int = 16  # minibatches of each pass
+    memory: float = 0.8  # factor per batch by which older batches fade when danger is measured
 
     def validate(self, name: str) -> None:
         """Raises ValueError, naming the field after `name`, if a value is out of range."""
@@ -58,65 +59,65 @@ class ActorCriticConfig:
 
     @property
     def steps(self) -> int:
-        """Agent steps of a batch."""
+        """The number of environment steps in a batch."""
         return self.num_envs * self.length
 
 
 class Recent(NamedTuple):
-    """Sums over the batches so far, in which the older ones fade."""
+    """Sums over the batches so far, in which older ones fade."""
 
-    danger: Array  # () of the episodes that ended
-    episodes: Array  # () that ended
-    steps: Array  # ()
+    danger: Array  # () danger of the episodes that ended
+    episodes: Array  # () number of episodes that ended
+    steps: Array  # () number of steps
 
 
 class Spread(NamedTuple):
-    """How large returns are, from the discounted reward of each episode so far at each step."""
+    """How large returns are: the mean square of the discounted reward of the episodes so far."""
 
-    squares: Array  # () sum of its square
-    steps: Array  # ()
+    squares: Array  # () sum over all steps of the square of the discounted reward so far
+    steps: Array  # () number of steps
 
     @property
     def scale(self) -> Array:
-        """() its root mean square; 1 before anything was earned."""
+        """The root mean square, (); 1 before anything was earned."""
         return jnp.where(self.squares > 0, jnp.sqrt(self.squares / self.steps), 1.0)
 
 
 class State(NamedTuple):
-    """Carried through learning."""
+    """The state of the learner between two batches."""
 
     states: Any  # (B,) environment states
-    running: base.Running  # (B,) episodes
-    earned: Array  # (B,) their reward, less the penalty, discounted as of now
-    spread: Spread
-    recent: Recent
-    actor: Any
-    critic: Any
-    critic_opt: optax.OptState
-    key: Array
+    running: tally.Running  # (B,) sums over the episodes under way
+    earned: Array  # (B,) their reward so far less penalties, earlier steps discounted more
+    spread: Spread  # how large returns are
+    recent: Recent  # recent danger
+    actor: Any  # weights of the policy
+    critic: Any  # weights of the critic
+    critic_opt: optax.OptState  # state of the critic's optimiser
+    key: Array  # random key of the next batch
 
 
 class Batch(NamedTuple):
-    """N = length x num_envs steps."""
+    """A batch of N = length * num_envs steps."""
 
-    encoded: Encoded  # (N,)
-    elapsed: Array  # (N,) share of the time of an episode
-    action: Array  # (N,) or (N, 2)
-    advantage: Array  # (N, 2) of reward and of danger
-    target: Array  # (N, 2) what the critic should have said
+    encoded: Encoded  # (N,) observations
+    elapsed: Array  # (N,) elapsed fraction of an episode's time
+    action: Array  # (N,) int or (N, 2) float
+    advantage: Array  # (N, 2) advantages of reward and of danger
+    target: Array  # (N, 2) values that the critic should have predicted
 
 
 class Metrics(NamedTuple):
-    """Sums over a batch; divide by `episodes` or `steps`."""
+    """Sums over a batch, to be divided by `episodes` or `steps`."""
 
-    steps: Array
-    episodes: Array
-    score: Array  # of the finished episodes
-    danger: Array  # likewise
-    crashes: Array  # finished episodes with any danger
-    goals: Array
-    bad_observations: Array  # states seen with a number that is nan or infinite
-    bad_rewards: Array  # steps, likewise of the reward or the danger
+    steps: Array  # () number of steps
+    episodes: Array  # () number of episodes that ended
+    score: Array  # () their reward, without any penalty
+    danger: Array  # () their danger
+    crashes: Array  # () number of these episodes with any danger
+    goals: Array  # () number of these episodes that reached the goal
+    bad_observations: Array  # () number of observations with a value that is nan or infinite
+    bad_rewards: Array  # () number of steps with a reward or danger that is nan or infinite
 
 
 class _Step(NamedTuple):
@@ -125,32 +126,52 @@ class _Step(NamedTuple):
     encoded: Encoded
     elapsed: Array
     action: Array
-    signal: Array  # (B, 2) reward, less the penalty, and danger
-    value: Array  # (B, 2) of the state
-    next_value: Array  # (B, 2) of the state it led to, a terminal one included
+    signal: Array  # (B, 2) reward less the penalty, and danger
+    value: Array  # (B, 2) values of the state
+    next_value: Array  # (B, 2) values of the state that it led to, terminal ones included
     done: Array
 
 
 def make_actor(pmdp: PMDP, config: ActorCriticConfig) -> nn.Module:
-    """The policy network that the configuration names."""
-    num_actions = pmdp.env.num_actions(pmdp.params)
-    return ACTORS[config.policy](num_actions=num_actions, scale=pmdp.env.SCALE)
+    """Returns the policy network that the configuration names.
+
+    Args:
+        pmdp: the environment.
+        config: settings.
+    """
+    num_actions = optional.num_actions(pmdp.env, pmdp.params)
+    return ACTORS[config.policy](num_actions=num_actions, scale=optional.scale(pmdp.env))
 
 
 def make_critic(pmdp: PMDP) -> nn.Module:
-    """The networks of both values."""
-    return Critic(scale=pmdp.env.SCALE)
+    """Returns the network of both values.
+
+    Args:
+        pmdp: the environment.
+    """
+    return Critic(scale=optional.scale(pmdp.env))
 
 
 def elapsed_of(states: Any, pmdp: PMDP) -> Array:
-    """(B,) how much of an episode's time is over, 0 to 1."""
+    """Returns the elapsed fraction of each episode's time, (B,) in [0, 1].
+
+    Args:
+        states: states of the environment, leading axis (B,).
+        pmdp: the environment.
+    """
     return states.time / pmdp.params.time_limit
 
 
 def driver(
     network: nn.Module, weights: Any, *, greedy: bool = False
 ) -> Callable[[Array, Percept], tuple[Array, Array]]:
-    """The policy as `evaluate.play_episodes` takes it: drawn at random, or always the mode."""
+    """Returns the policy in the form that `evaluation.play_episodes` takes.
+
+    Args:
+        network: the policy network.
+        weights: its weights.
+        greedy: whether to always take the likeliest action instead of drawing one.
+    """
 
     def choose(key: Array, percept: Percept) -> tuple[Array, Array]:
         found: Any = network.apply(weights, percept.encoded)
@@ -161,7 +182,13 @@ def driver(
 
 
 def init(key: Array, pmdp: PMDP, config: ActorCriticConfig) -> State:
-    """Starts all environments, a policy and a critic."""
+    """Starts all environments, a policy and a critic.
+
+    Args:
+        key: random key for starts, weights and learning.
+        pmdp: the environment.
+        config: settings.
+    """
     reset_key, actor_key, critic_key, key = jax.random.split(key, 4)
     resets = jax.random.split(reset_key, config.num_envs)
     states = jax.vmap(pmdp.env.reset, (0, None))(resets, pmdp.params)
@@ -171,7 +198,7 @@ def init(key: Array, pmdp: PMDP, config: ActorCriticConfig) -> State:
     zero = jnp.zeros_like(pmdp.x)
     return State(
         states=states,
-        running=base.Running(nothing, nothing),
+        running=tally.Running(nothing, nothing),
         earned=nothing,
         spread=Spread(zero, zero),
         recent=Recent(zero, zero, zero),
@@ -190,17 +217,20 @@ def gae(
     discount: Array,
     trace: float,
 ) -> Array:
-    """(T,) generalised advantages (GAE, Schulman et al. 2016) of one environment.
+    """Returns generalised advantages of one environment's steps (Schulman et al. 2016).
 
-    After an end nothing more comes; after the batch's last step, the value of the state reached.
+    After an end nothing follows; after the batch's last step, the value of the state reached does.
 
     Args:
         signal: (T,) reward or danger of each step.
-        value: (T,) of the state before it.
-        next_value: (T,) of the state after it, before any fresh start.
-        done: (T,) bool, the episode ended there.
-        discount: () of the signal.
+        value: (T,) value of the state before each step.
+        next_value: (T,) value of the state after each step, before any new start.
+        done: (T,) bool, the episode ended with the step.
+        discount: () discount of the signal.
         trace: lambda.
+
+    Returns:
+        (T,).
     """
     chex.assert_equal_shape([signal, value, next_value, done])
     chex.assert_rank(signal, 1)
@@ -215,7 +245,7 @@ def gae(
 
 
 def _advantages(steps: _Step, scale: Array, config: ActorCriticConfig) -> Array:
-    """(T, B, 2) of both signals, reward in units of `scale`."""
+    """Returns the advantages (T, B, 2) of both signals, reward in units of `scale`."""
     signal = steps.signal / jnp.stack([scale, jnp.ones_like(scale)])[None, None]
     discounts = jnp.asarray([config.gamma, config.beta], steps.value.dtype)
     each_signal = jax.vmap(gae, (1, 1, 1, None, 0, None), 1)
@@ -226,10 +256,20 @@ def _advantages(steps: _Step, scale: Array, config: ActorCriticConfig) -> Array:
 def collect(
     key: Array, state: State, pmdp: PMDP, config: ActorCriticConfig
 ) -> tuple[State, Batch, Metrics]:
-    """All environments act for `length` steps; nothing is learned.
+    """Lets all environments act for `length` steps, without learning.
 
-    Rewards are less `pmdp.penalty` per unit of danger; values and advantages of them are in units
-    of what returns have been so far (their root mean square), whatever the task pays.
+    `pmdp.penalty` is subtracted from the reward per unit of danger. Values and advantages of reward
+    are in units of the returns so far (their root mean square), so that they do not depend on the
+    size of a task's rewards.
+
+    Args:
+        key: random key for actions and environments.
+        state: the learner's state.
+        pmdp: the environment.
+        config: settings.
+
+    Returns:
+        The learner's state with environments and statistics updated, the batch, and its metrics.
     """
     actor, critic = make_actor(pmdp, config), make_critic(pmdp)
 
@@ -243,13 +283,13 @@ def collect(
         policy: Any = actor.apply(state.actor, encoded)
         action = policy.sample(act_key)
         keys = jax.random.split(step_key, config.num_envs)
-        carried, (_, (_, _, next_value)), outcome = base.step_and_renew(
+        carried, (_, (_, _, next_value)), outcome = autoreset.step_and_renew(
             pmdp.env, keys, states, action, pmdp.params, look
         )
         reward = outcome.reward - pmdp.penalty * outcome.danger
         signal = jnp.stack([reward, outcome.danger], axis=-1)
         step = _Step(encoded, elapsed, action, signal, value, next_value, outcome.done)
-        running, ended = base.tally(running, outcome)
+        running, ended = tally.tally(running, outcome)
         earned = config.gamma * earned + reward
         dtype = ended.score.dtype
         bad_observation, bad_signal = faults(encoded, signal)
@@ -281,7 +321,14 @@ def collect(
 
 
 def update_critic(state: State, batch: Batch, pmdp: PMDP, config: ActorCriticConfig) -> State:
-    """One gradient step of both values towards their targets."""
+    """Makes one gradient step of both values towards their targets.
+
+    Args:
+        state: the learner's state.
+        batch: a batch, or part of one.
+        pmdp: the environment.
+        config: settings.
+    """
     critic = make_critic(pmdp)
 
     def loss(params):
@@ -300,14 +347,17 @@ def pass_over(
     update: Callable[[Any, Any], Any],
     config: ActorCriticConfig,
 ) -> Any:
-    """`epochs` times all of the batch in a random order, an update for each minibatch.
+    """Passes over a batch `epochs` times in random order, with an update for each minibatch.
 
     Args:
-        key: of the orders.
+        key: random key for the orders.
         carry: what is updated.
         batch: pytree with leading axis (steps,).
-        update: maps what is carried and a minibatch, a part of `batch`, to what is carried on.
-        config: sizes.
+        update: maps what is carried and a minibatch (rows of `batch`) to what is carried on.
+        config: settings.
+
+    Returns:
+        What is carried after the last update.
     """
 
     def epoch(carry, key):

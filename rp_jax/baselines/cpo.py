@@ -17,8 +17,8 @@ from rp_jax.baselines.actor_critic import DANGER, REWARD, ActorCriticConfig, Bat
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import number
 
-ENOUGH = 1e-5  # residual of conjugate gradients, relative: beyond, rounding makes them 0 / 0
-TINY = 1e-12  # keeps quotients of what may vanish finite
+ENOUGH = 1e-5  # relative residual that ends conjugate gradients; below it, rounding gives 0 / 0
+TINY = 1e-12  # least denominator, so that quotients stay finite
 UNCONSTRAINED, CONSTRAINED, RECOVERY = range(3)  # how a step was chosen
 
 
@@ -26,13 +26,13 @@ UNCONSTRAINED, CONSTRAINED, RECOVERY = range(3)  # how a step was chosen
 class CPOConfig:
     """Hyperparameters of the learner."""
 
-    # The gradient of rare danger takes more of a batch than PPO does.
+    # The gradient of rare danger needs larger batches than PPO does.
     rollout: ActorCriticConfig = field(default_factory=lambda: ActorCriticConfig(num_envs=256))
     divergence: float = 0.01  # delta, the trust region: greatest mean KL divergence of an update
     damping: float = 0.01  # added to the diagonal of the Fisher matrix
-    products: int = 10  # conjugate gradient iterations
-    backtracks: int = 15  # attempts of the line search, each shorter by `shrink`
-    shrink: float = 0.8
+    products: int = 10  # number of conjugate gradient iterations
+    backtracks: int = 15  # number of attempts of the line search
+    shrink: float = 0.8  # factor of the step's length from one attempt to the next
 
     def validate(self, name: str) -> None:
         """Raises ValueError, naming the field after `name`, if a value is out of range."""
@@ -45,25 +45,26 @@ class CPOConfig:
 
 
 class Update(NamedTuple):
-    """What became of an update."""
+    """The result of an update."""
 
     kl: Array  # () mean divergence of the new policy from the old one
-    case: Array  # () int, UNCONSTRAINED, CONSTRAINED or RECOVERY
+    case: Array  # () int: UNCONSTRAINED, CONSTRAINED or RECOVERY
     accepted: Array  # () bool, the line search found a step
 
 
 class Metrics(NamedTuple):
-    """Of one step."""
+    """Metrics of one step of the learner."""
 
     rollout: actor_critic.Metrics
     update: Update
 
 
 def compiler_options() -> dict[str, str]:
-    """What to compile `step` or `improve` with, as `jax.jit(..., compiler_options=...)`.
+    """Returns the options that `step` or `improve` must be compiled with.
 
-    On a CPU, jaxlib 0.10 fuses some products for YNNPACK wrongly: on large batches the conjugate
-    gradients come out as nan or worse, and the line search then accepts no step.
+    They belong to `jax.jit(..., compiler_options=...)`. On a CPU, jaxlib 0.10 fuses some products
+    for YNNPACK wrongly: on large batches the conjugate gradients come out as nan or worse, and the
+    line search then accepts no step.
     """
     wrong = jax.default_backend() == "cpu" and jaxlib.__version__.startswith("0.10.")
     return {"xla_cpu_experimental_ynn_fusion_type": ""} if wrong else {}
@@ -72,13 +73,13 @@ def compiler_options() -> dict[str, str]:
 def fisher_product(
     policy: Callable[[Array], Any], theta: Array, damping: float
 ) -> Callable[[Array], Array]:
-    """The product of the Fisher matrix at `theta` (P,), damped, with a vector (P,).
+    """Returns the function that multiplies a vector (P,) by the damped Fisher matrix.
 
     The matrix is J'MJ, the Hessian of the mean KL divergence from the policy at `theta`: J is the
-    Jacobian of the distributions' parameters, M the Hessian of the divergence in these.
+    Jacobian of the distributions' parameters, and M the Hessian of the divergence in these.
 
     Args:
-        policy: distributions of a batch of states, for weights (P,).
+        policy: maps weights (P,) to the distributions of a batch of states.
         theta: (P,) weights.
         damping: added to the diagonal.
     """
@@ -98,10 +99,11 @@ def step_lengths(
 ) -> tuple[Array, Array, Array]:
     """Solves max g'x subject to excess + b'x <= 0 and x'Hx / 2 <= delta, by its dual.
 
-    With v = H^-1 g and w = H^-1 b the solution is x = along v - against w: `along` is 1 / lambda
-    and `against` nu / lambda in the dual's multipliers. Where the best step of the trust region
-    keeps the constraint, nu is 0; else the best one lies on both boundaries. Where no step of the
-    trust region keeps it, x reduces the danger as fast as can be (their recovery step).
+    With v = H^-1 g and w = H^-1 b the solution is x = along v - against w, where `along` is 1 /
+    lambda and `against` is nu / lambda in the dual's multipliers. If the best step of the trust
+    region keeps the constraint, nu is 0; otherwise the best step lies on both boundaries. If no
+    step of the trust region keeps it, x reduces the danger as fast as possible (the recovery step
+    of Achiam et al.).
 
     Args:
         q: () g'v.
@@ -109,16 +111,16 @@ def step_lengths(
         s: () b'w.
         excess: () by how much the constraint is violated; negative where it is kept.
         delta: radius of the trust region.
-        reach: () what to take for s where it is asked whether a step of the region keeps the
-            constraint; s if not given.
+        reach: () estimate of s to decide whether any step of the region keeps the constraint; s by
+            default.
 
     Returns:
-        (along, against, case).
+        (along, against, case), () each.
     """
     reach = s if reach is None else reach
     free = jnp.sqrt(2 * delta / jnp.maximum(q, TINY))
     slope = r / jnp.maximum(s, TINY)
-    # Of the region, on the constraint.
+    # What the trust region leaves for steps along the constraint.
     left, surely = (2 * delta - excess * excess / jnp.maximum(a, TINY) for a in (s, reach))
     gain = jnp.maximum(q - r * slope, TINY)  # of reward along the constraint
     bound = jnp.sqrt(jnp.maximum(left, 0.0) / gain)
@@ -141,20 +143,23 @@ def step_lengths(
 def improve(
     params: Any, network: nn.Module, batch: Batch, excess: Array, config: CPOConfig
 ) -> tuple[Any, Update]:
-    """One update of the policy (their Algorithm 1). To be compiled with `compiler_options`.
+    """Makes one update of the policy (Algorithm 1 of Achiam et al.).
 
-    s = b'H^-1 b says how far a step can lower the danger, and noise in b adds to it: where crashes
-    are rare, a step would seem to keep a constraint that it does not come near to, and the danger
-    would stay. So whether to recover is decided with b of two halves of the batch, b1'H^-1 b2,
-    which noise does not raise; rows of the halves alternate, so they are of different environments
-    if the number of these is even.
+    To be compiled with `compiler_options`. The product s = b'H^-1 b says how far a step can lower
+    the danger, and noise in b adds to it: where crashes are rare, a step would seem to keep a
+    constraint that it does not come near to, and the danger would stay. So whether to recover is
+    decided with b of two halves of the batch, b1'H^-1 b2, which noise does not raise. The halves
+    take alternate rows, and so different environments if the number of these is even.
 
     Args:
-        params: of the policy.
-        network: of the policy.
-        batch: drawn from it.
-        excess: () danger per step, beyond what the limit allows.
+        params: weights of the policy.
+        network: the policy network.
+        batch: steps of this policy.
+        excess: () by how much the danger per step exceeds the limit.
         config: hyperparameters.
+
+    Returns:
+        The new weights, and a summary of the update.
     """
     theta, unravel = ravel_pytree(params)
 
@@ -166,12 +171,12 @@ def improve(
     advantage = batch.advantage - jnp.mean(batch.advantage, axis=0, keepdims=True)
 
     def surrogates(theta: Array) -> Array:
-        """(2,) how reward and danger per step change."""
+        """Returns how reward and danger per step change, (2,)."""
         ratio = jnp.exp(policy(theta).log_prob(batch.action) - before)
         return jnp.mean(ratio[:, None] * advantage, axis=0)
 
     def dangers(theta: Array) -> Array:
-        """(2,) how danger per step changes, by the even and by the odd rows."""
+        """Returns how danger per step changes, (2,), from the even and from the odd rows."""
         change = jnp.exp(policy(theta).log_prob(batch.action) - before) * advantage[:, DANGER]
         return jnp.stack([jnp.mean(change[::2]), jnp.mean(change[1::2])])
 
@@ -204,24 +209,34 @@ def improve(
 
 
 def init(key: Array, pmdp: PMDP, config: CPOConfig) -> State:
-    """Starts all environments, a policy and a critic."""
+    """Starts all environments, a policy and a critic.
+
+    Args:
+        key: random key for starts, weights and learning.
+        pmdp: the environment.
+        config: hyperparameters.
+    """
     return actor_critic.init(key, pmdp, config.rollout)
 
 
 def step(state: State, pmdp: PMDP, limit: Array, config: CPOConfig) -> tuple[State, Metrics]:
-    """Collects a batch, then improves policy and critic. To be compiled with `compiler_options`.
+    """Collects a batch, then improves policy and critic.
+
+    To be compiled with `compiler_options`.
 
     Args:
-        state: carried.
-        pmdp: the environment; without threats, as nothing is forbidden. Its penalty is taken off
-            the rewards.
-        limit: () the greatest expected danger of an episode, not discounted; sweep it by `vmap`.
+        state: the learner's state.
+        pmdp: the environment, not shielded. Its penalty is subtracted from the rewards.
+        limit: () greatest expected danger of an episode, not discounted; may be swept by `vmap`.
         config: hyperparameters.
+
+    Returns:
+        The learner's state after the step, and metrics.
     """
     key, collect_key, fit_key = jax.random.split(state.key, 3)
     state, batch, metrics = actor_critic.collect(collect_key, state, pmdp, config.rollout)
-    # The limit is of an episode; advantages are of a step, so both go by the step. One batch alone
-    # may hold less than a crash where the limit is kept.
+    # The limit holds for an episode, while advantages belong to a step: both are compared per step.
+    # A single batch may hold less than one crash where the limit is kept.
     recent = state.recent
     excess = (recent.danger - limit * recent.episodes) / recent.steps
     network = actor_critic.make_actor(pmdp, config.rollout)

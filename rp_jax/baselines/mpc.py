@@ -1,8 +1,8 @@
 """Model predictive control: tree search in the true model, a few steps ahead (appendix G.4).
 
-Agent, walls and rewards come from the environment's own step, taken without the hazards that move.
-Each of these has a virtual environment of its own, stepped by its `HazardSource`: the search takes
-the expectation over all that it may do, and sums the dangers of all of them.
+The agent's body, walls and rewards come from the environment's own step, without the hazards that
+move. Each of these is simulated apart by its `HazardSource`: the search takes the expectation over
+everything that it may do, and sums the dangers of all of them.
 """
 
 from collections.abc import Callable
@@ -14,39 +14,54 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from rp_jax.envs.base import Env
-from rp_jax.planning.pmdp import PMDP, Percept
+from rp_jax.envs import optional
+from rp_jax.envs.contract import Env
+from rp_jax.planning.percept import Percept
+from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import number
 
-UNSAFE = 1e4  # taken off beyond the limit of danger; more than any reward within a horizon
-SAME = 1e-4  # by which two ways to add up one score may differ
-CHUNK = 16  # sequences of first actions tried at a time
-LOTS = 0x107  # of actions that are equally good
+UNSAFE = 1e4  # subtracted above the limit of danger; more than any reward within a horizon
+SAME = 1e-4  # scores that differ by less are equal up to rounding
+CHUNK = 16  # number of sequences of first actions tried at a time
+LOTS = 0x107  # seed for the choice among equally good actions
 
 
 class Model(Env, Protocol):
-    """An environment that is deterministic once the hazards that move are taken out."""
+    """An environment that is deterministic without its moving hazards."""
 
-    def alone(self, state: Any) -> Any:
-        """`state` without the hazards that move."""
+    def without_moving_hazards(self, state: Any) -> Any:
+        """Returns a state without the hazards that move.
+
+        Args:
+            state: any state.
+        """
 
 
 class Search(struct.PyTreeNode):
-    """What is searched, and for what. Build by `make_search`."""
+    """The model and the settings of a search; to be built by `make_search`."""
 
-    params: Any  # of the environment
-    penalty: Array  # () taken off the reward per unit of danger
-    limit: Array  # () safe sequences, of at most this danger, come before all others
-    model: Model = struct.field(pytree_node=False)
-    horizon: int = struct.field(pytree_node=False)  # actions that a sequence has
+    params: Any  # the environment's parameters
+    penalty: Array  # () subtracted from the reward per unit of danger
+    limit: Array  # () sequences of at most this danger are safe and come before all others
+    model: Model = struct.field(pytree_node=False)  # the environment
+    horizon: int = struct.field(pytree_node=False)  # number of actions of a sequence
 
     @property
     def actions(self) -> Array:
-        """(A,) all of them."""
-        return jnp.arange(self.model.num_actions(self.params))
+        """All actions, (A,) int."""
+        return jnp.arange(optional.num_actions(self.model, self.params))
 
     def score(self, node: "Node") -> Array:
-        """() reward less penalised danger; beyond the limit, the less danger the better."""
+        """Returns a node's reward less its penalised danger.
+
+        Above the limit, less danger is always better.
+
+        Args:
+            node: the end of a sequence.
+
+        Returns:
+            ().
+        """
         unsafe = jnp.where(node.danger > self.limit, UNSAFE * (1 + node.danger), 0.0)
         return node.reward - self.penalty * node.danger - unsafe
 
@@ -54,14 +69,14 @@ class Search(struct.PyTreeNode):
 def make_search(
     model: Model, params: Any, horizon: int, penalty: float, limit: float = np.inf
 ) -> Search:
-    """A search, checked.
+    """Returns a search, checked.
 
     Args:
         model: the environment.
-        params: of the environment.
-        horizon: actions of a sequence; the work grows with num_actions^(horizon - 1).
-        penalty: taken off the reward per unit of danger: 200 on Circuit, 50 on Jam.
-        limit: the greatest danger of a sequence that counts as safe; inf: danger only costs.
+        params: the environment's parameters.
+        horizon: number of actions of a sequence; the work grows with num_actions^(horizon - 1).
+        penalty: subtracted from the reward per unit of danger: 200 on Circuit, 50 on Jam.
+        limit: greatest danger of a sequence that counts as safe; with infinity danger only costs.
 
     Raises:
         ValueError: a value is out of range.
@@ -81,22 +96,27 @@ def make_search(
 class Movers(NamedTuple):
     """All that each moving hazard of one kind may be doing."""
 
-    state: Any  # leading axes (N, M): hazards, branches
+    state: Any  # states of the hazards, leading axes (N, M): hazards, branches
     weight: Array  # (N, M) probability of the branch; 0 once it has hit
 
 
 class Node(NamedTuple):
-    """Where a sequence of actions leads."""
+    """The situation that a sequence of actions leads to."""
 
-    state: Any  # of the environment, without the hazards that move
-    movers: dict[str, Movers]  # by kind
-    reward: Array  # () so far
-    danger: Array  # () expected so far, summed over hazards
-    done: Array  # () bool
+    state: Any  # the environment's state, without the hazards that move
+    movers: dict[str, Movers]  # the moving hazards by kind
+    reward: Array  # () reward so far
+    danger: Array  # () expected danger so far, summed over hazards
+    done: Array  # () bool, the episode has ended
 
 
 def root(state: Any, search: Search) -> Node:
-    """The node of the empty sequence; each moving hazard has one branch."""
+    """Returns the node of the empty sequence, in which each moving hazard has one branch.
+
+    Args:
+        state: the environment's state.
+        search: the model and the settings.
+    """
     model, zero = search.model, jnp.zeros(())
     subs = model.sub_rmdps(search.params)
     movers = {
@@ -105,20 +125,26 @@ def root(state: Any, search: Search) -> Node:
             weight=group.present[:, None].astype(zero.dtype),
         )
         for kind, group in model.hazards(state, search.params).items()
-        if not subs[kind].source.static  # the environment's step knows the static ones
+        if not subs[kind].source.static  # the environment's own step includes the static ones
     }
-    return Node(model.alone(state), movers, zero, zero, jnp.zeros((), bool))
+    return Node(model.without_moving_hazards(state), movers, zero, zero, jnp.zeros((), bool))
 
 
 def follow(node: Node, action: Array, search: Search) -> Node:
-    """The node one action further; after the end, nothing is earned or risked."""
+    """Returns the node one action further; after the end, nothing is earned or risked.
+
+    Args:
+        node: where the action is taken.
+        action: () int.
+        search: the model and the settings.
+    """
     key = jax.random.key(0)  # nothing random is left
     reached, outcome = search.model.step(key, node.state, action, search.params)
     subs = search.model.sub_rmdps(search.params)
     danger, movers = outcome.danger, {}
     for kind, group in node.movers.items():
         source = subs[kind].source
-        movers[kind], hits = _branch(group, node.state.agent, reached.agent, source)
+        movers[kind], hits = _branch(group, node.state.body, reached.body, source)
         danger = danger + hits
     return Node(
         state=reached,
@@ -129,20 +155,26 @@ def follow(node: Node, action: Array, search: Search) -> Node:
     )
 
 
-def _branch(movers: Movers, before: Any, agent: Any, source: Any) -> tuple[Movers, Array]:
-    """One step of hazards, each branch splitting into the K things that it may do.
+def _branch(movers: Movers, before: Any, body: Any, source: Any) -> tuple[Movers, Array]:
+    """Moves hazards by one step; each branch splits into the K things that its hazard may do.
+
+    Args:
+        movers: the hazards of one kind.
+        before: the body's state before the step.
+        body: the body's state after the step.
+        source: the kind of hazard.
 
     Returns:
-        The branches (N, M * K), and () the expected number of hazards that hit for the first time.
+        The branches (N, M * K), and the expected number of hazards that hit for the first time, ().
     """
     behaviour = source.behaviour
 
     def split(hazard: Any, weight: Array) -> tuple[Any, Array, Array]:
         def one(control: Any) -> tuple[Any, Array]:
             moved = source.step(hazard, before, control)
-            return moved, source.hits(agent, moved)
+            return moved, source.hits(body, moved)
 
-        # A control moves a hazard one step later, so that all its branches hit alike.
+        # A control moves a hazard only one step later, so that its branches all hit, or none does.
         moved, hit = jax.vmap(one, out_axes=(0, None))(behaviour.controls)
         return moved, jnp.where(hit, 0.0, weight) * behaviour.probabilities, hit
 
@@ -152,30 +184,48 @@ def _branch(movers: Movers, before: Any, agent: Any, source: Any) -> tuple[Mover
 
 
 def best(node: Node, steps: int, search: Search) -> Array:
-    """() score of the best of all sequences of `steps` actions that go on from a node."""
+    """Returns the score of the best continuation of a node, ().
+
+    Args:
+        node: where the continuation begins.
+        steps: number of its actions.
+        search: the model and the settings.
+    """
     if steps == 0:
         return search.score(node)
     return jnp.max(_by_action(node, steps, search))
 
 
 def _by_action(node: Node, steps: int, search: Search) -> Array:
-    # What does not depend on the last action, such as where it leads, is computed once for all.
+    # What does not depend on the last action (as the next position does not) is computed only once.
     return jax.vmap(lambda a: best(follow(node, a, search), steps - 1, search))(search.actions)
 
 
 def exhaustive(state: Any, search: Search) -> Array:
-    """(A,) score of each action: that of the best sequence which it begins."""
+    """Returns the score of each action, (A,): that of the best sequence that begins with it.
+
+    Args:
+        state: the environment's state.
+        search: the model and the settings.
+    """
     return _by_action(root(state, search), search.horizon, search)
 
 
 def pruned(state: Any, search: Search) -> Array:
-    """(A,) what `exhaustive` finds for the best actions, and no more than that for others.
+    """Returns the scores of `exhaustive` for the best actions, and lower bounds of them for others.
 
-    Sequences of first actions are tried in the order of what they promise (`_promises`), until
-    none promises more than what has been found.
+    Sequences of first actions are tried in the order of their upper bounds, until no bound exceeds
+    the best score found.
+
+    Args:
+        state: the environment's state.
+        search: the model and the settings.
+
+    Returns:
+        (A,); minus infinity for actions that were not tried.
     """
     start = root(state, search)
-    # Moving hazards make each look-up at the end dear; otherwise, two levels are cheap in one go.
+    # With moving hazards each last step is expensive; otherwise two levels at once are cheap.
     depth = max(1, search.horizon - (1 if start.movers else 2))
     promise = _promises(start, depth, search)
     order = jnp.argsort(-promise)
@@ -195,7 +245,7 @@ def pruned(state: Any, search: Search) -> Array:
 
     def more(carry: tuple[Array, Array]) -> tuple[Array, Array]:
         tried, scores = carry
-        # At the end, some are tried again: the slice moves back.
+        # The last slice moves back, so that some sequences are tried twice.
         rows = jax.lax.dynamic_slice(order, (tried,), (min(CHUNK, len(order)),))
         found = jnp.where(promise[rows] > -jnp.inf, jax.vmap(value)(rows), -jnp.inf)
         return tried + CHUNK, scores.at[rows // places[0]].max(found)
@@ -205,10 +255,11 @@ def pruned(state: Any, search: Search) -> Array:
 
 
 def _promises(start: Node, depth: int, search: Search) -> Array:
-    """(A^depth,) the most that each sequence of `depth` actions may lead to.
+    """Returns an upper bound of the score of each sequence of `depth` first actions, (A^depth,).
 
-    With hazards that move: the score if all of them vanished. Without, that of a sequence which
-    has ended, and infinity for others. -inf for all but one of sequences that do the same.
+    With moving hazards it is the score as if all of them vanished. Without, it is the score itself
+    for sequences that have ended, and infinity for others. Of sequences that do the same, all but
+    one get minus infinity.
     """
     nodes = jax.tree.map(lambda a: a[None], start._replace(movers={}))
     fan = jax.vmap(follow, (None, 0, None))
@@ -225,11 +276,11 @@ def _promises(start: Node, depth: int, search: Search) -> Array:
 
 
 def _distinct(fan: Node, ended: Array) -> Array:
-    """(A,) bool, the actions without those that do what an earlier one does.
+    """Returns which actions do not merely repeat an earlier one, (A,) bool.
 
     Args:
         fan: the nodes after each action, leading axis (A,).
-        ended: () bool, there is nothing to do: the first action stands for all.
+        ended: () bool, the episode has ended: the first action stands for all.
     """
     leaves = [leaf.reshape(len(leaf), -1).astype(float) for leaf in jax.tree.leaves(fan)]
     rows = jnp.concatenate(leaves, axis=-1)
@@ -238,42 +289,60 @@ def _distinct(fan: Node, ended: Array) -> Array:
 
 
 class Seen(NamedTuple):
-    """What MPC is given in the place of observations."""
+    """The observation that MPC gets: the state itself."""
 
-    states: Any  # leading axis (B,)
-    alive: Array  # (B,) bool, whether an action is needed
+    states: Any  # states of the environment, leading axis (B,)
+    alive: Array  # (B,) bool, an action is needed
 
 
 class Omniscient(PMDP):
-    """A P-MDP for policies that are given the state itself; learners get a `PMDP`."""
+    """A P-MDP for policies that observe the state itself; learners get a `PMDP`."""
 
     def perceive(self, states: Any, alive: Array | None = None) -> Percept:
-        """As in `PMDP`, with a `Seen` for what is encoded there."""
+        """Returns the percept of a `PMDP`, with a `Seen` in place of the observation.
+
+        Args:
+            states: states, leading axis (B,).
+            alive: (B,) bool; where it is False, no action is needed.
+        """
         needed = jnp.ones(states.time.shape, bool) if alive is None else alive
         percept = super().perceive(states, alive)
         return percept._replace(encoded=Seen(states, needed))  # type: ignore[arg-type]
 
 
 def omniscient(search: Search) -> Omniscient:
-    """What a search is evaluated in: its environment, with nothing forbidden."""
+    """Returns the P-MDP to evaluate a search in: its environment, with all actions admissible.
+
+    Args:
+        search: the model and the settings.
+    """
     nothing = jnp.zeros(())
     return Omniscient(
         params=search.params,
-        threats=None,
+        threats={},
+        shielded=False,
         x=jnp.asarray(jnp.inf),
         penalty=nothing,
-        toll=nothing,
+        insecure_penalty=nothing,
         env=search.model,
     )
 
 
 def drawn(state: Any, scores: Array) -> Array:
-    """(A,) 0, but for the best of the scores: positive numbers in a random order.
+    """Returns a random preference among the best actions.
 
-    Equal scores are frequent, and the first actions of a table have much in common. The lots are
-    drawn from the state, so that a search has no key.
+    Equal scores are frequent, and the first actions of a table are much alike. The random numbers
+    come from the state, so that a search needs no key.
+
+    Args:
+        state: the environment's state.
+        scores: (A,) scores of the actions.
+
+    Returns:
+        (A,) random positive numbers for actions whose scores equal the best one up to rounding, 0
+        for others.
     """
-    place = jax.lax.bitcast_convert_type(state.agent.position.astype(jnp.float32), jnp.uint32)
+    place = jax.lax.bitcast_convert_type(state.body.position.astype(jnp.float32), jnp.uint32)
     key = jax.random.key(LOTS)
     for part in (state.time, *place):
         key = jax.random.fold_in(key, part)
@@ -282,9 +351,16 @@ def drawn(state: Any, scores: Array) -> Array:
 
 
 def values(search: Search) -> Callable[[Percept], Array]:
-    """Prefers (B, A) the best actions, for `evaluate.run_episodes` with an `Omniscient`.
+    """Returns the scores of a search, in the form that `evaluation.run_episodes` takes.
 
-    States are searched one after another: memory is that of one, and none waits for a harder one.
+    They hold for an `Omniscient` P-MDP. States are searched one after another, so that memory is
+    needed for one only, and none waits for a harder one.
+
+    Args:
+        search: the model and the settings.
+
+    Returns:
+        A function from a percept to scores (B, A), greatest for the action to take.
     """
     count = len(search.actions)
 

@@ -15,22 +15,22 @@ from rp_jax.baselines.actor_critic import DANGER, REWARD, ActorCriticConfig, Bat
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import number
 
-FAR = 10.0  # beyond the limit, in units of it
-SMALL = 1e-6  # keeps quotients finite: the least that a limit counts as
+FAR = 10.0  # greatest excess of danger that counts, in units of the limit
+SMALL = 1e-6  # least denominator, so that quotients stay finite
 
 
 @dataclass(frozen=True)
 class PIDConfig:
     """Hyperparameters of the learner."""
 
-    # What comes long after an action is noise in the danger of it, and a penalty amplifies it.
+    # Danger long after an action is mostly noise, which a penalty amplifies: so it is discounted.
     rollout: ActorCriticConfig = field(default_factory=lambda: ActorCriticConfig(beta=0.9))
-    learning_rate: float = 3e-4  # of the policy
-    clip: float = 0.2  # of the probability ratio
-    divergence: float = 0.01  # from the policy that acted, at which a batch moves it no more
-    proportional: float = 0.1  # gains, of danger in units of its limit
-    integral: float = 0.01
-    derivative: float = 0.1
+    learning_rate: float = 3e-4  # learning rate of the policy
+    clip: float = 0.2  # clip range of the probability ratio
+    divergence: float = 0.01  # KL divergence from the acting policy at which updates stop
+    proportional: float = 0.1  # gain of the excess of danger, in units of its limit
+    integral: float = 0.01  # gain of the excess summed over batches
+    derivative: float = 0.1  # gain of the rise of danger since the batch before
 
     def validate(self, name: str) -> None:
         """Raises ValueError, naming the field after `name`, if a value is out of range."""
@@ -44,34 +44,44 @@ class PIDConfig:
 
 
 class Controller(NamedTuple):
-    """What the penalty remembers."""
+    """The memory of the penalty's controller."""
 
-    integral: Array  # () sum of what was beyond the limit, never below 0
-    danger: Array  # () of an episode, as measured last
+    integral: Array  # () sum of danger's excess over the limit, in its units, never below 0
+    danger: Array  # () danger of an episode, as measured last
 
 
 class State(NamedTuple):
-    """Carried through learning."""
+    """The state of the learner between two batches."""
 
-    learner: actor_critic.State
-    actor_opt: optax.OptState
-    controller: Controller
+    learner: actor_critic.State  # environments, policy and critic
+    actor_opt: optax.OptState  # state of the policy's optimiser
+    controller: Controller  # memory of the penalty's controller
 
 
 class Metrics(NamedTuple):
-    """Of one step."""
+    """Metrics of one step of the learner."""
 
     rollout: actor_critic.Metrics
-    penalty: Array  # () lambda
+    penalty: Array  # () lambda, the penalty per unit of danger
 
 
 def control(
     controller: Controller, danger: Array, limit: Array, config: PIDConfig
 ) -> tuple[Controller, Array]:
-    """The penalty lambda from the danger of the last episodes (Stooke et al., Algorithm 2).
+    """Returns the penalty lambda for the danger of the last episodes (Stooke et al., Algorithm 2).
 
-    Danger counts in units of the limit, since it can fall below it by one of them alone; and no
-    more than `FAR` of them, or what a fresh policy does would be held against it for ever.
+    Danger is measured in units of the limit, since it can fall below the limit by at most one of
+    them. At most `FAR` units count, since otherwise the danger of an untrained policy would raise
+    the penalty for far too long.
+
+    Args:
+        controller: the controller's memory.
+        danger: () danger of an episode.
+        limit: () greatest danger wanted.
+        config: hyperparameters.
+
+    Returns:
+        The controller's new memory, and lambda ().
     """
     unit = jnp.maximum(limit, SMALL)
     error = jnp.clip((danger - limit) / unit, -1.0, FAR)
@@ -84,15 +94,18 @@ def control(
 def objective(
     params: Any, network: nn.Module, batch: Batch, gain: Array, before: Array, clip: float
 ) -> Array:
-    """() the clipped surrogate of PPO (Schulman et al. 2017), to be maximised.
+    """Returns the clipped surrogate objective of PPO (Schulman et al. 2017), to be maximised.
 
     Args:
-        params: of the policy.
-        network: of the policy.
+        params: weights of the policy.
+        network: the policy network.
         batch: (N,) steps.
         gain: (N,) advantages, penalty included.
-        before: (N,) log probabilities under the policy that acted.
-        clip: how far the ratio may move the objective.
+        before: (N,) log probabilities of the actions under the policy that acted.
+        clip: clip range of the probability ratio.
+
+    Returns:
+        ().
     """
     policy: Any = network.apply(params, batch.encoded)
     ratio = jnp.exp(policy.log_prob(batch.action) - before)
@@ -100,9 +113,16 @@ def objective(
 
 
 def moved(params: Any, network: nn.Module, batch: Batch, before: Array) -> Array:
-    """() KL divergence from the policy that acted, estimated from its actions: E[r - 1 - log r].
+    """Estimates the KL divergence from the policy that acted, by E[r - 1 - log r] over its actions.
 
-    Arguments are those of `objective`.
+    Args:
+        params: weights of the policy.
+        network: the policy network.
+        batch: (N,) steps.
+        before: (N,) log probabilities of the actions under the policy that acted.
+
+    Returns:
+        ().
     """
     policy: Any = network.apply(params, batch.encoded)
     log_ratio = policy.log_prob(batch.action) - before
@@ -110,13 +130,27 @@ def moved(params: Any, network: nn.Module, batch: Batch, before: Array) -> Array
 
 
 def penalised(advantage: Array, penalty: Array) -> Array:
-    """(N,) A_r - lambda A_d of advantages (N, 2), standardised once they are one."""
+    """Returns A_r - lambda A_d, standardised to mean 0 and standard deviation 1.
+
+    Args:
+        advantage: (N, 2) advantages of reward and of danger.
+        penalty: () lambda.
+
+    Returns:
+        (N,).
+    """
     gain = advantage[:, REWARD] - penalty * advantage[:, DANGER]
     return (gain - jnp.mean(gain)) / (jnp.std(gain) + SMALL)
 
 
 def init(key: Array, pmdp: PMDP, config: PIDConfig) -> State:
-    """Starts all environments, a policy and a critic; the penalty is 0."""
+    """Starts all environments, a policy and a critic; the penalty starts at 0.
+
+    Args:
+        key: random key for starts, weights and learning.
+        pmdp: the environment.
+        config: hyperparameters.
+    """
     learner = actor_critic.init(key, pmdp, config.rollout)
     nothing = jnp.zeros_like(pmdp.x)
     opt = optax.adam(config.learning_rate).init(learner.actor)
@@ -126,12 +160,19 @@ def init(key: Array, pmdp: PMDP, config: PIDConfig) -> State:
 def step(state: State, pmdp: PMDP, limit: Array, config: PIDConfig) -> tuple[State, Metrics]:
     """Collects a batch, adapts the penalty, then improves policy and critic.
 
-    Arguments are those of `cpo.step`.
+    Args:
+        state: the learner's state.
+        pmdp: the environment, not shielded. Its penalty is subtracted from the rewards.
+        limit: () greatest expected danger of an episode, not discounted; may be swept by `vmap`.
+        config: hyperparameters.
+
+    Returns:
+        The learner's state after the step, and metrics.
     """
     rollout = config.rollout
     key, collect_key, fit_key = jax.random.split(state.learner.key, 3)
     learner, batch, metrics = actor_critic.collect(collect_key, state.learner, pmdp, rollout)
-    # Where no episode has ended, nothing is known of them; the first ones are no rise.
+    # Before any episode has ended, their danger is unknown; the first ones do not count as a rise.
     recent, known = learner.recent, state.learner.recent.episodes > 0
     danger = jnp.where(recent.episodes > 0, recent.danger / recent.episodes, limit)
     before = jnp.where(known, state.controller.danger, danger)

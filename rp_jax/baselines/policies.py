@@ -1,4 +1,4 @@
-"""Random policies and values: tanh perceptrons on what the Q-networks see (appendix G.3)."""
+"""Random policies and critics: tanh perceptrons on the Q-networks' observations (appendix G.3)."""
 
 from typing import NamedTuple
 
@@ -8,36 +8,48 @@ from flax import linen as nn
 from jax import Array
 
 from rp_jax.planning.networks import features
-from rp_jax.planning.pmdp import Encoded
+from rp_jax.planning.percept import Encoded
 
-CONTROLS = 2  # acceleration and turn, as `kinematics.AgentModel.control` takes them
-LOG_STD = -1.0  # of a fresh policy's actions, whose range is [-1, 1]
+CONTROLS = 2  # acceleration and turn, as `dynamics.VehicleModel.control` takes them
+LOG_STD = -1.0  # initial log standard deviation of the actions, whose range is [-1, 1]
 
 
 class Gaussian(NamedTuple):
-    """Independent normal distributions of a continuous action's components."""
+    """Independent normal distributions of the components of a continuous action."""
 
-    mean: Array  # (..., D)
-    log_std: Array  # (..., D)
+    mean: Array  # (..., D) means
+    log_std: Array  # (..., D) logarithms of the standard deviations
 
     @property
     def mode(self) -> Array:
-        """(..., D) the likeliest action."""
+        """The likeliest action, (..., D)."""
         return self.mean
 
     def sample(self, key: Array) -> Array:
-        """(..., D) one action; the environment cuts it to [-1, 1]."""
+        """Draws an action, (..., D); the environment clips it to [-1, 1].
+
+        Args:
+            key: random key.
+        """
         noise = jax.random.normal(key, self.mean.shape, self.mean.dtype)
         return self.mean + jnp.exp(self.log_std) * noise
 
     def log_prob(self, action: Array) -> Array:
-        """(...) log density of actions (..., D)."""
+        """Returns the log density of actions, (...).
+
+        Args:
+            action: (..., D).
+        """
         error = (action - self.mean) * jnp.exp(-self.log_std)
         each = -0.5 * jnp.square(error) - self.log_std - 0.5 * jnp.log(2 * jnp.pi)
         return jnp.sum(each, axis=-1)
 
     def kl(self, other: "Gaussian") -> Array:
-        """(...) KL divergence of `other` from this."""
+        """Returns the KL divergence KL(self || other), (...).
+
+        Args:
+            other: the other distribution, of the same shape.
+        """
         spread = jnp.exp(2 * (self.log_std - other.log_std))
         error = jnp.square((self.mean - other.mean) * jnp.exp(-other.log_std))
         each = other.log_std - self.log_std + 0.5 * (spread + error - 1)
@@ -45,36 +57,51 @@ class Gaussian(NamedTuple):
 
 
 class Categorical(NamedTuple):
-    """Probabilities of a finite number of actions."""
+    """A distribution over a finite number of actions."""
 
-    logits: Array  # (..., A)
+    logits: Array  # (..., A) unnormalised log probabilities
 
     @property
     def log_probs(self) -> Array:
-        """(..., A) normalised."""
+        """The log probabilities, (..., A)."""
         return nn.log_softmax(self.logits)
 
     @property
     def mode(self) -> Array:
-        """(...) int, the likeliest action."""
+        """The likeliest action, (...) int."""
         return jnp.argmax(self.logits, axis=-1)
 
     def sample(self, key: Array) -> Array:
-        """(...) int, one action."""
+        """Draws an action, (...) int.
+
+        Args:
+            key: random key.
+        """
         return jax.random.categorical(key, self.logits)
 
     def log_prob(self, action: Array) -> Array:
-        """(...) log probability of actions (...)."""
+        """Returns the log probability of actions, (...).
+
+        Args:
+            action: (...) int.
+        """
         return jnp.take_along_axis(self.log_probs, action[..., None], axis=-1)[..., 0]
 
     def kl(self, other: "Categorical") -> Array:
-        """(...) KL divergence of `other` from this."""
+        """Returns the KL divergence KL(self || other), (...).
+
+        Args:
+            other: the other distribution, of the same shape.
+        """
         each = jnp.exp(self.log_probs) * (self.log_probs - other.log_probs)
         return jnp.sum(each, axis=-1)
 
 
 def _perceptron(x: Array, hidden: tuple[int, ...], size: int, name: str) -> Array:
-    """(..., size) after tanh layers; small at first, so that a fresh policy is even-handed."""
+    """Returns the output (..., size) of tanh layers.
+
+    Its initial values are small, so that a new policy prefers no action.
+    """
     for i, width in enumerate(hidden):
         x = nn.tanh(nn.Dense(width, name=f"{name}_{i}")(x))
     last = nn.initializers.variance_scaling(0.01, "fan_in", "truncated_normal")
@@ -82,43 +109,59 @@ def _perceptron(x: Array, hidden: tuple[int, ...], size: int, name: str) -> Arra
 
 
 class GaussianActor(nn.Module):
-    """Means from a perceptron, standard deviations alike in all states."""
+    """A policy with means from a perceptron, and the same standard deviations in all states."""
 
-    num_actions: int  # not used: an action is continuous
-    scale: tuple[float, ...]  # of the observation beside the LIDAR
-    hidden: tuple[int, ...] = (64, 32)
+    num_actions: int  # not used, since actions are continuous
+    scale: tuple[float, ...]  # factors of the observation beside the LIDAR
+    hidden: tuple[int, ...] = (64, 32)  # widths of the hidden layers
 
     @nn.compact
     def __call__(self, seen: Encoded) -> Gaussian:
-        """The distribution of actions (..., 2)."""
+        """Returns the distribution of actions (..., 2).
+
+        Args:
+            seen: observations, leading axes (...).
+        """
         mean = _perceptron(features(seen, self.scale), self.hidden, CONTROLS, "mean")
         log_std = self.param("log_std", nn.initializers.constant(LOG_STD), (CONTROLS,))
         return Gaussian(mean, jnp.broadcast_to(log_std, mean.shape))
 
 
 class CategoricalActor(nn.Module):
-    """Probabilities of the environment's discrete actions."""
+    """A policy over the environment's discrete actions."""
 
     num_actions: int
-    scale: tuple[float, ...]
-    hidden: tuple[int, ...] = (64, 32)
+    scale: tuple[float, ...]  # factors of the observation beside the LIDAR
+    hidden: tuple[int, ...] = (64, 32)  # widths of the hidden layers
 
     @nn.compact
     def __call__(self, seen: Encoded) -> Categorical:
-        """The distribution of actions (...) int."""
+        """Returns the distribution of actions, (...) int.
+
+        Args:
+            seen: observations, leading axes (...).
+        """
         logits = _perceptron(features(seen, self.scale), self.hidden, self.num_actions, "logits")
         return Categorical(logits)
 
 
 class Critic(nn.Module):
-    """Two perceptrons apart: the value of reward and the value of danger."""
+    """Two separate perceptrons, for the value of reward and the value of danger."""
 
-    scale: tuple[float, ...]
-    hidden: tuple[int, ...] = (64, 32)
+    scale: tuple[float, ...]  # factors of the observation beside the LIDAR
+    hidden: tuple[int, ...] = (64, 32)  # widths of the hidden layers
 
     @nn.compact
     def __call__(self, seen: Encoded, elapsed: Array) -> Array:
-        """(..., 2) values, of reward and of danger; `elapsed` (...) is 0 to 1."""
+        """Returns the values of reward and of danger.
+
+        Args:
+            seen: observations, leading axes (...).
+            elapsed: (...) elapsed fraction of the episode's time, in [0, 1].
+
+        Returns:
+            (..., 2).
+        """
         x = jnp.concatenate([features(seen, self.scale), elapsed[..., None]], axis=-1)
         towers = [_perceptron(x, self.hidden, 1, name) for name in ("reward", "danger")]
         return jnp.concatenate(towers, axis=-1)

@@ -1,1 +1,5 @@
-"""Environments: who moves how, what is dangerous, what is seen."""
+"""Environments: how bodies move, what is dangerous, and what is observed."""
+
+from rp_jax.envs.contract import Env, Hazards, Outcome
+
+__all__ = ["Env", "Hazards", "Outcome"]

@@ -1,9 +1,9 @@
 """Point Gather: collect apples and avoid bombs in a square room, 15 steps (paper, appendix F).
 
-Every bomb can be collected once, and an episode goes on after it: the danger of a step is the
-number of bombs that it collects. So the discounted danger of an episode is the sum over bombs of
-beta^K, K the step at which each is hit, and the threat under a baseline policy is *equal* to the
-sum over bombs of single-bomb threats (Theorem 3 without slack, docs/theory.md).
+Every bomb can be collected once, and the episode continues: the danger of a step is the number of
+bombs that it collects. So the discounted danger of an episode is the sum over bombs of beta^K,
+where K is the step at which each is hit, and the threat under a baseline policy is *equal* to the
+sum over bombs of single-bomb threats (Theorem 3 with equality, docs/theory.md).
 """
 
 import jax
@@ -12,11 +12,10 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from rp_jax.envs import base
-from rp_jax.hazards import Bomb, SubRMDP
-from rp_jax.kinematics import (
-    AgentModel,
+from rp_jax import arrays
+from rp_jax.dynamics import (
     Vehicle,
+    VehicleModel,
     angle_of,
     control_table,
     independent_controls,
@@ -24,59 +23,67 @@ from rp_jax.kinematics import (
     squared_distance,
     to_ego,
 )
+from rp_jax.envs import contract
+from rp_jax.hazards import Bomb, SubRMDP
 from rp_jax.validate import number, one_of, positive
 
-ROOM = 6.0  # half the side of the square room
+ROOM = 6.0  # half the side of the square room, room units
 ACCELERATIONS = tuple(k / 4 for k in range(-4, 5))  # steps forward, room units
 TURNS = tuple(k / 16 for k in range(-4, 5))  # radians / step
-FORWARD = (0.025,) * 4 + (0.18,) * 5  # the baseline steps back once in ten times
-REACH = 1.0  # an object nearer than this to the centre of mass is collected
-AHEAD = 0.04258348498809698  # of the centre of mass: the body's arrow weighs something
+FORWARD = (0.025,) * 4 + (0.18,) * 5  # probabilities: the baseline policy steps back one time in 10
+REACH = 1.0  # objects nearer than this to the centre of mass are collected, room units
+AHEAD = 0.04258348498809698  # room units by which the body's arrow moves its centre of mass forward
 APPLE = 10.0  # reward of an apple
-BINS = 10  # of each sensor, over the front half plane
-RANGE = 6.0  # of the sensors, room units
+BINS = 10  # number of bins of each sensor, over the front half plane
+RANGE = 6.0  # range of the sensors, room units
 LIDAR_BINS = 0
 SCALE: tuple[float, ...] = (
     *(1 / 6, 1 / 6, 1.0),  # position, angle
     *(1.0, 1.0, 1.0),  # velocity
     *(1 / 6, 1 / 6, 1.0),  # centre of mass
     *(1.0,) * (2 * BINS),  # apples, bombs
-)  # of an observation, for learners
-USUAL_BOMBS = 8  # in the paper
+)  # factors of an observation, for learners
+USUAL_BOMBS = 8  # number of bombs in the paper
 
 
 class Objects(struct.PyTreeNode):
-    """The apples, or the bombs."""
+    """The apples of a state, or its bombs."""
 
     position: Array  # (n, 2) room units
     present: Array  # (n,) bool, not yet collected
 
 
 class State(struct.PyTreeNode):
-    """The agent, what is left to collect, and whether the last step collected a bomb."""
+    """The body, the objects, and whether the last step collected a bomb."""
 
-    agent: Vehicle
-    angle: Array  # () of the heading, radians, full turns included
-    velocity: Array  # (3,) of the start, never to change: seen, and nothing else
+    body: Vehicle
+    angle: Array  # () angle of the heading, radians, full turns included
+    velocity: Array  # (3,) drawn at the start; it is observed, never changes, and has no effect
     apples: Objects
     bombs: Objects
-    hit: Array  # () bool
+    hit: Array  # () bool, the last step collected a bomb
     time: Array  # () int32, steps since the start
 
 
 class Params(struct.PyTreeNode):
-    """Build by `make_params`; `time_limit` and `beta` can be replaced, or swept by `vmap`."""
+    """The task's parameters; to be built by `make_params`.
 
-    agent: AgentModel
+    The fields `time_limit` and `beta` can be replaced, or swept by `vmap`.
+    """
+
+    body: VehicleModel
     bomb: Bomb
-    time_limit: Array  # () int32, steps
-    beta: Array  # () discount of danger
+    time_limit: Array  # () int32, steps of an episode
+    beta: Array  # () discount of danger in the threat
     n_apples: int = struct.field(pytree_node=False, default=2)
     n_bombs: int = struct.field(pytree_node=False, default=USUAL_BOMBS)
 
 
 def cells() -> np.ndarray:
-    """(35, 2) where objects may lie: a grid of width 2 without its middle, where the agent is."""
+    """Returns the places where objects may lie, (35, 2) room units.
+
+    They form a grid of width 2, without the middle, where the body starts.
+    """
     side = np.arange(-6.0, 6.0, 2.0)
     grid = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
     return grid[np.abs(grid).max(axis=-1) > 0]
@@ -91,13 +98,13 @@ def make_params(
     beta: float = 0.999,
     fidelity: str = "released",
 ) -> Params:
-    """The task's parameters, checked.
+    """Returns the task's parameters, checked.
 
     Args:
-        n_apples: 2 in the paper.
-        n_bombs: 8 in the paper.
+        n_apples: number of apples; 2 in the paper.
+        n_bombs: number of bombs; 8 in the paper.
         time_limit: steps of an episode.
-        horizon: steps after which a rollout of the threat is cut. The default cuts nothing off.
+        horizon: steps after which a rollout of the threat is cut; the default cuts nothing off.
         beta: discount of danger in the threat.
         fidelity: "released" collects from the centre of mass of a body that is heavier in front;
             "paper" has a point mass.
@@ -105,16 +112,16 @@ def make_params(
     Raises:
         ValueError: a value is out of range.
     """
-    one_of("fidelity", fidelity, base.FIDELITIES)
+    one_of("fidelity", fidelity, contract.FIDELITIES)
     room = len(cells())
     number("n_bombs", n_bombs, least=1, most=room, integer=True)
-    # Of two numbers that do not fit together, that one is named which leaves its usual.
+    # If two numbers do not fit together, the message names the one that differs from the paper's.
     number("n_apples", n_apples, least=0, most=room - min(n_bombs, USUAL_BOMBS), integer=True)
     number("n_bombs", n_bombs, least=1, most=room - n_apples, integer=True)
     positive("time_limit", time_limit, most=10**9, integer=True)
     positive("horizon", horizon, most=100, integer=True)
     positive("beta", beta, most=1.0)
-    agent = AgentModel(
+    body = VehicleModel(
         actions=control_table(ACCELERATIONS, TURNS),
         baseline=independent_controls(ACCELERATIONS, FORWARD, TURNS, (1 / 9,) * 9),
         speeds=jnp.asarray(ACCELERATIONS, float),
@@ -122,8 +129,8 @@ def make_params(
         delayed=False,
     )
     return Params(
-        agent=agent,
-        bomb=Bomb.create(agent, REACH, horizon, AHEAD if fidelity == "released" else 0.0),
+        body=body,
+        bomb=Bomb.create(body, REACH, horizon, AHEAD if fidelity == "released" else 0.0),
         time_limit=jnp.asarray(time_limit, jnp.int32),
         beta=jnp.asarray(beta, float),
         n_apples=n_apples,
@@ -132,16 +139,16 @@ def make_params(
 
 
 def start_at(position: Array, angle: Array, apples: Array, bombs: Array) -> State:
-    """A state with the agent and all objects anywhere, at time 0.
+    """Returns a state at time 0 with body and objects in given places.
 
     Args:
-        position: (2,) of the agent, room units.
-        angle: () of its heading, radians.
-        apples: (n, 2) positions.
-        bombs: (m, 2) positions.
+        position: (2,) of the body, room units.
+        angle: () angle of its heading, radians.
+        apples: (n, 2) positions of the apples, room units.
+        bombs: (m, 2) positions of the bombs, room units.
     """
     return State(
-        agent=make_vehicle(position, angle, 0.0),
+        body=make_vehicle(position, angle, 0.0),
         angle=jnp.asarray(angle, float),
         velocity=jnp.zeros(3),
         apples=Objects(apples, jnp.ones(len(apples), bool)),
@@ -152,36 +159,50 @@ def start_at(position: Array, angle: Array, apples: Array, bombs: Array) -> Stat
 
 
 def reset(key: Array, params: Params) -> State:
-    """The agent near the middle, facing along x; every object in a cell of its own."""
+    """Draws a start: the body near the middle, facing along x, and objects in cells of their own.
+
+    Args:
+        key: random key.
+        params: the task's parameters.
+    """
     pose_key, velocity_key, cell_key = jax.random.split(key, 3)
     pose = 0.01 * jax.random.normal(pose_key, (3,))
     grid = jnp.asarray(cells(), float)
-    order = base.ranks(jax.random.uniform(cell_key, (len(grid),)))
+    order = arrays.ranks(jax.random.uniform(cell_key, (len(grid),)))
     shuffled = jnp.zeros_like(grid).at[order].set(grid)
     apples, bombs, _ = jnp.split(shuffled, [params.n_apples, params.n_apples + params.n_bombs])
     state = start_at(pose[:2], pose[2], apples, bombs)
     return state.replace(velocity=0.1 * jax.random.normal(velocity_key, (3,)))
 
 
-def _collect(agent: Vehicle, objects: Objects, params: Params) -> tuple[Objects, Array]:
-    """What is left, and the number collected, () int."""
-    taken = jax.vmap(params.bomb.hits, (None, 0))(agent, objects.position) & objects.present
+def _collect(body: Vehicle, objects: Objects, params: Params) -> tuple[Objects, Array]:
+    """Returns the objects that are left, and the number collected, () int."""
+    taken = jax.vmap(params.bomb.hits, (None, 0))(body, objects.position) & objects.present
     return objects.replace(present=objects.present & ~taken), jnp.sum(taken)
 
 
-def step(key: Array, state: State, action: Array, params: Params) -> tuple[State, base.Outcome]:
-    """One transition; `key` is not used, since nothing here is random.
+def step(key: Array, state: State, action: Array, params: Params) -> tuple[State, contract.Outcome]:
+    """Makes one transition, which is deterministic.
 
-    The reward is 10 per apple, the danger 1 per bomb. Only when nothing is left to collect does
-    an episode end before the time limit.
+    The reward is 10 per apple, the danger 1 per bomb. The episode ends before the time limit only
+    when nothing is left to collect.
+
+    Args:
+        key: not used.
+        state: the state before.
+        action: () int, or (2,) float, as for `VehicleModel.control`.
+        params: the task's parameters.
+
+    Returns:
+        The state after, and the step's outcome.
     """
     del key
-    control = params.agent.control(action)
-    agent = params.agent.step(state.agent, control)
-    apples, gained = _collect(agent, state.apples, params)
-    bombs, hurt = _collect(agent, state.bombs, params)
+    control = params.body.control(action)
+    body = params.body.step(state.body, control)
+    apples, gained = _collect(body, state.apples, params)
+    bombs, hurt = _collect(body, state.bombs, params)
     reached = state.replace(
-        agent=agent,
+        body=body,
         angle=state.angle + angle_of(control.rotation),
         apples=apples,
         bombs=bombs,
@@ -189,8 +210,8 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
         time=state.time + 1,
     )
     left = jnp.any(apples.present) | jnp.any(bombs.present)
-    terminated, truncated = base.ended(~left, reached.time, params.time_limit)
-    return reached, base.Outcome(
+    terminated, truncated = contract.ended(~left, reached.time, params.time_limit)
+    return reached, contract.Outcome(
         reward=APPLE * gained.astype(state.angle.dtype),
         danger=hurt.astype(state.angle.dtype),
         terminated=terminated,
@@ -199,10 +220,13 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
     )
 
 
-def _readings(agent: Vehicle, objects: Objects, params: Params) -> Array:
-    """(10,) per bin of the front half plane, right to left: 1 - distance / 6 of the nearest."""
-    place = params.bomb.centre(agent)
-    local = to_ego(objects.position - place[None], agent.heading[None])
+def _readings(body: Vehicle, objects: Objects, params: Params) -> Array:
+    """Returns a sensor's readings (10,): 1 - distance / 6 of the nearest object in each bin.
+
+    The bins divide the front half plane, from right to left; 0 stands for no object.
+    """
+    place = params.bomb.centre(body)
+    local = to_ego(objects.position - place[None], body.heading[None])
     distance = jnp.sqrt(squared_distance(local, jnp.zeros((1, 2))))
     # In front, an object lies to the left of an edge where their cross product is positive.
     edges = np.linspace(-np.pi / 2, np.pi / 2, BINS + 1)[1:-1]
@@ -213,47 +237,83 @@ def _readings(agent: Vehicle, objects: Objects, params: Params) -> Array:
     return jnp.max(jnp.where(inside, 1 - distance[:, None] / RANGE, 0.0), axis=0, initial=0.0)
 
 
-def alone(state: State) -> State:
-    """The state without hazards that move: bombs do not."""
+def without_moving_hazards(state: State) -> State:
+    """Returns the state unchanged, since bombs do not move.
+
+    Args:
+        state: any state.
+    """
     return state
 
 
 def observe(state: State, params: Params) -> Array:
-    """(29,) pose (3), velocity (3), centre of mass (3), apples seen (10), bombs seen (10)."""
-    agent = state.agent
+    """Returns the observation of a state.
+
+    Args:
+        state: the state.
+        params: the task's parameters.
+
+    Returns:
+        (29,) position and angle (3), velocity (3), centre of mass (3), readings for apples (10) and
+        for bombs (10).
+    """
+    body = state.body
     return jnp.concatenate(
         [
-            agent.position,
+            body.position,
             state.angle[None],
             state.velocity,
-            params.bomb.centre(agent),
-            jnp.full(1, 0.5, agent.position.dtype),  # height of the body
-            _readings(agent, state.apples, params),
-            _readings(agent, state.bombs, params),
+            params.bomb.centre(body),
+            jnp.full(1, 0.5, body.position.dtype),  # height of the body
+            _readings(body, state.apples, params),
+            _readings(body, state.bombs, params),
         ]
     )
 
 
-def hazards(state: State, params: Params) -> dict[str, base.Hazards]:
-    """The bombs that are left."""
-    return {"bomb": base.Hazards(state.bombs.position, state.bombs.present)}
+def hazards(state: State, params: Params) -> dict[str, contract.Hazards]:
+    """Returns the bombs, of which those not yet collected are present.
+
+    Args:
+        state: the state.
+        params: the task's parameters.
+    """
+    return {"bomb": contract.Hazards(state.bombs.position, state.bombs.present)}
 
 
-def causes(state: State, params: Params) -> dict[str, Array]:
-    """Whether the step that led here has collected a bomb."""
+def collisions(state: State, params: Params) -> dict[str, Array]:
+    """Returns whether the step that led to the state collected a bomb, () bool under "bomb".
+
+    Args:
+        state: the state.
+        params: the task's parameters.
+    """
     return {"bomb": state.hit}
 
 
 def clearance(position: Array, params: Params) -> Array:
-    """() infinite: nothing that can be hit stays from one episode to the next."""
+    """Returns infinity, since no hazard is in the same place in all episodes.
+
+    Args:
+        position: (2,) of the body.
+        params: the task's parameters.
+    """
     return jnp.full((), jnp.inf, position.dtype)
 
 
 def sub_rmdps(params: Params) -> dict[str, SubRMDP]:
-    """One agent and one bomb, in the same room."""
-    return {"bomb": SubRMDP(agent=params.agent, source=params.bomb, beta=params.beta)}
+    """Returns the sub-R-MDP of the body and one bomb, in the same room.
+
+    Args:
+        params: the task's parameters.
+    """
+    return {"bomb": SubRMDP(body=params.body, source=params.bomb, beta=params.beta)}
 
 
 def num_actions(params: Params) -> int:
-    """81 = 9 steps forward x 9 turns."""
-    return params.agent.actions.acceleration.shape[-1]
+    """Returns the number of actions: 9 steps forward times 9 turns.
+
+    Args:
+        params: the task's parameters.
+    """
+    return params.body.actions.acceleration.shape[-1]

@@ -1,4 +1,4 @@
-"""Tracks as data: a centre line, two walls, and a small builder for one's own."""
+"""Tracks as data: a centre line and two walls, with a builder for new ones."""
 
 from dataclasses import dataclass, field, replace
 
@@ -8,31 +8,33 @@ from flax import struct
 from jax import Array
 from scipy.spatial import cKDTree
 
-from rp_jax import sensing
-from rp_jax.envs.base import least_radius
+from rp_jax.envs import sensing
+from rp_jax.envs.walls import least_radius
 from rp_jax.validate import number, positive, shown
 
-SPACING = 0.02  # of points along straights, room units
-ALONG = 0.055  # of points along curves, at most, room units
+SPACING = 0.02  # distance between points along straights, room units
+ALONG = 0.055  # greatest distance between points along curves, room units
 CELL = 0.2  # width of the look-up cells, room units
 VIEW = 1.0  # range of the LIDAR, room units
-LONGEST = 10_000  # points of a centre line, at most
-WIDEST = 5.0  # half-width, room units
+LONGEST = 10_000  # greatest number of points of a centre line
+WIDEST = 5.0  # greatest half-width, room units
 LARGEST = 50.0  # side of the square that a track has to fit into, room units
 
 
 @dataclass(frozen=True)
 class TrackPlan:
-    """A centre line drawn from (0, 0) along +x, one piece after another; each call returns a new
-    plan, the old one is left as it was, and raises ValueError if the piece cannot be drawn.
+    """The plan of a track: a centre line drawn from (0, 0) along +x, one piece after another.
+
+    Each method returns a new plan and leaves the old one unchanged. It raises ValueError if the
+    piece cannot be drawn. For example:
 
     >>> TrackPlan().straight(2.0).curve(1.0, 180).straight(2.0).curve(1.0, 180)
     """
 
-    half_width: float = 0.3
-    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))  # (n, 2)
-    angles: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (n,) heading, radians
-    position: tuple[float, float] = (0.0, 0.0)
+    half_width: float = 0.3  # distance of each wall from the centre line, room units
+    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))  # (n, 2) room units
+    angles: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (n,) headings, radians
+    position: tuple[float, float] = (0.0, 0.0)  # where the next piece begins, room units
     angle: float = 0.0  # heading at `position`, radians
 
     def _extend(self, points, angles, position, angle) -> "TrackPlan":
@@ -45,7 +47,14 @@ class TrackPlan:
         )
 
     def straight(self, length: float) -> "TrackPlan":
-        """Goes straight on for `length` > 0, rounded up to whole steps of SPACING."""
+        """Returns the plan with a straight appended.
+
+        Args:
+            length: room units, greater than 0; rounded up to a multiple of `SPACING`.
+
+        Raises:
+            ValueError: the length is out of range.
+        """
         positive("straight: length", length, most=SPACING * LONGEST)
         count = int(np.ceil(length / SPACING - 1e-6))
         way = np.arange(count + 1)[:, None] * SPACING
@@ -53,9 +62,16 @@ class TrackPlan:
         return self._extend(points[:-1], np.full(count, self.angle), points[-1], self.angle)
 
     def curve(self, radius: float, degrees: float) -> "TrackPlan":
-        """Turns by whole `degrees` (left is positive) on a circle of `radius` > 0.
+        """Returns the plan with part of a circle appended.
 
-        With a point for each degree, or several where they would be farther apart than ALONG.
+        It has a point for each degree, or several where these would be farther apart than `ALONG`.
+
+        Args:
+            radius: radius of the centre line, room units, greater than 0.
+            degrees: whole number of degrees to turn by, not 0; to the left is positive.
+
+        Raises:
+            ValueError: a value is out of range.
         """
         positive("curve: radius", radius, most=LARGEST)
         number("curve: degrees", degrees, least=-LONGEST, most=LONGEST)
@@ -71,14 +87,21 @@ class TrackPlan:
         return self._extend(points[:-1], angles[:-1], points[-1], angles[-1])
 
     def close(self, radius: float = 0.3) -> "TrackPlan":
-        """Drives home to the start: straight, one turn of `radius`, straight along +x."""
+        """Returns the plan with a way back to the start: a straight, one turn, a straight along +x.
+
+        Args:
+            radius: radius of the turn, room units, greater than 0.
+
+        Raises:
+            ValueError: one turn does not lead back from here.
+        """
         positive("close: radius", radius, most=LARGEST)
         left = (-np.degrees(self.angle) + 180) % 360 - 180
         turn = round(left)
         if abs(left - turn) > 1e-6:
             raise ValueError(f"close: {left} degrees are left to turn; they must be whole")
         if turn == -180 and self.position[1] > 0:
-            turn = 180  # from above, the way home is to the left
+            turn = 180  # from above, the way back is to the left
         sine = np.sin(self.angle)
         # The turn ends on the line y = 0 if it starts at this height.
         height = radius * abs(1 - np.cos(self.angle)) * np.sign(self.position[1])
@@ -93,32 +116,36 @@ class TrackPlan:
         if plan.position[0] >= 0:
             raise ValueError(f"close: the turn ends at x = {plan.position[0]:.3f}; it must be < 0")
         plan = plan.straight(-plan.position[0])
-        # The last straight keeps its end point, as the released track does, unless that is the
-        # very start.
+        # The last straight keeps its end point, as in the released code, unless that point is the
+        # start itself.
         if np.hypot(*plan.position) < 1e-9:
             return plan
         end = np.asarray([plan.position])
         return plan._extend(end, np.asarray([plan.angle]), plan.position, plan.angle)
 
     def widened(self, half_width: float) -> "TrackPlan":
-        """The same centre line with another half-width."""
+        """Returns the plan with the same centre line and another half-width.
+
+        Args:
+            half_width: distance of each wall from the centre line, room units.
+        """
         return replace(self, half_width=half_width)
 
 
 def default_plan() -> TrackPlan:
-    """The paper's circuit (figure 6, top), 1,253 points."""
+    """Returns the plan of the paper's circuit (figure 6, top), with 1,253 points."""
     plan = TrackPlan().straight(2.0).curve(0.3, 45).straight(1.0).curve(1.0, 225)
     plan = plan.curve(0.5, -145).straight(1.5).curve(1.2, 75).straight(0.5).curve(0.3, 110)
     return plan.straight(0.5).curve(0.3, -90).straight(0.5).curve(0.5, 120).close()
 
 
 def narrowed_plan() -> TrackPlan:
-    """The default circuit with half-width .25 (table 2, "narrowed")."""
+    """Returns the default circuit with half-width 0.25 (table 2, "narrowed")."""
     return default_plan().widened(0.25)
 
 
 def circle_plan() -> TrackPlan:
-    """A circle of radius 3 (table 2, "circular"; figure 6, bottom)."""
+    """Returns the plan of a circle of radius 3 (table 2, "circular"; figure 6, bottom)."""
     return TrackPlan().curve(3.0, 360)
 
 
@@ -126,29 +153,29 @@ PLANS = {"default": default_plan, "narrowed": narrowed_plan, "circle": circle_pl
 
 
 class Track(struct.PyTreeNode):
-    """A closed track, ready for look-ups. Build it by `make_track`."""
+    """A closed track with its look-up tables; to be built by `make_track`."""
 
-    centre: Array  # (n, 2) centre line, in driving order
+    centre: Array  # (n, 2) points of the centre line, in driving order, room units
     direction: Array  # (n, 2) unit tangents
     onward: Array  # (n, 2) unit vectors from each centre point to the next
-    walls: Array  # (w, 2) distinct wall points
-    nearest_centre: sensing.PointGrid
-    walls_in_view: sensing.PointGrid  # within VIEW
-    walls_in_contact: sensing.PointGrid  # within the vehicle's radius
-    walls_in_reach: sensing.PointGrid  # within the threat's window
+    walls: Array  # (w, 2) distinct wall points, room units
+    nearest_centre: sensing.PointGrid  # finds the nearest centre point
+    walls_in_view: sensing.PointGrid  # finds wall points within VIEW
+    walls_in_contact: sensing.PointGrid  # finds wall points within the vehicle's radius
+    walls_in_reach: sensing.PointGrid  # finds wall points that may have a threat
 
 
 def make_track(plan: TrackPlan, radius: float, fastest: float, reach: float) -> Track:
-    """Checks a plan and prepares its look-up tables.
+    """Checks a plan and returns the track with its look-up tables.
 
     Args:
         plan: a closed centre line.
-        radius: of the vehicle; walls nearer than this are a crash.
-        fastest: length of its longest step.
-        reach: largest distance at which a wall point can have a threat.
+        radius: radius of the vehicle, room units; a wall nearer than this is a crash.
+        fastest: length of the vehicle's longest step, room units.
+        reach: greatest distance at which a wall point can have a threat, room units.
 
     Raises:
-        ValueError: the track is too narrow, not closed, or crosses itself, or a step could lead
+        ValueError: the track is too narrow, not closed, or crosses itself; or a step could lead
             between two points of a wall.
     """
     _check_plan(plan, radius)
@@ -158,8 +185,8 @@ def make_track(plan: TrackPlan, radius: float, fastest: float, reach: float) -> 
     sides = np.stack([centre + left, centre - left], axis=1)  # (n, 2, 2)
     _check_walls(sides, radius, fastest)
     walls = sides.reshape(-1, 2)
-    # Coinciding points (the hub of a tight turn) are one event: counting it once keeps
-    # Theorem 3's bound, and makes it tighter.
+    # Coinciding points (the hub of a tight turn) are a single event: counting it once keeps the
+    # bound of Theorem 3, and makes it tighter.
     _, first = np.unique(walls.round(9), axis=0, return_index=True)
     walls = walls[np.sort(first)]
     room = cKDTree(walls).query(centre)[0]
@@ -183,12 +210,18 @@ def make_track(plan: TrackPlan, radius: float, fastest: float, reach: float) -> 
 
 
 def _steps(points: np.ndarray) -> np.ndarray:
-    """From each point (n, ...) of a closed line to the next."""
+    """Returns the vectors from each point (n, ...) of a closed line to the next."""
     return np.roll(points, -1, axis=0) - points
 
 
 def _check_walls(sides: np.ndarray, radius: float, fastest: float) -> None:
-    """That a vehicle cannot slip through: sides (n, 2, 2) are the walls' points, in order."""
+    """Raises ValueError if a vehicle could slip between two points of a wall.
+
+    Args:
+        sides: (n, 2, 2) points of both walls, in order.
+        radius: radius of the vehicle, room units.
+        fastest: length of the vehicle's longest step, room units.
+    """
     gaps = np.linalg.norm(_steps(sides), axis=-1).max(axis=1)
     i, least = int(gaps.argmax()), least_radius(float(gaps.max()), fastest)
     if radius <= least:
@@ -199,7 +232,7 @@ def _check_walls(sides: np.ndarray, radius: float, fastest: float) -> None:
 
 
 def _check_shape(plan: TrackPlan) -> None:
-    """What look-up tables could not be made of, or only of a size that nobody means."""
+    """Raises ValueError if look-up tables cannot be made of a plan, or would be far too large."""
     if not isinstance(plan, TrackPlan):
         raise ValueError(f"track is {shown(plan)}; it must be a TrackPlan")
     for name, tail in {"points": (2,), "angles": ()}.items():
@@ -234,6 +267,7 @@ def _check_shape(plan: TrackPlan) -> None:
 
 
 def _check_plan(plan: TrackPlan, radius: float) -> None:
+    """Raises ValueError if a plan is not closed, crosses itself, or is too narrow."""
     _check_shape(plan)
     number("track: half_width", plan.half_width, most=WIDEST)
     centre, width = plan.points, plan.half_width
@@ -248,8 +282,8 @@ def _check_plan(plan: TrackPlan, radius: float) -> None:
             f"track: the end misses the start by {gap:.3f} units and {np.degrees(turn):.0f} "
             "degrees; a track must be closed (see TrackPlan.close)"
         )
-    # Wherever the track is far along but near in space, its two parts would overlap. On a
-    # curve of radius >= half_width that is no nearer than half a turn of that radius.
+    # Two points that are far apart along the track but near in space mean that it overlaps. On a
+    # curve of radius >= half_width, points that near are at most half a turn of it apart.
     step = np.linalg.norm(_steps(centre), axis=-1)
     along = np.concatenate([[0.0], np.cumsum(step)[:-1]])
     total = step.sum()

@@ -1,6 +1,6 @@
-"""One planner for all thresholds: x is drawn at the start of each episode, and seen.
+"""One planner for all thresholds: x is drawn at the start of each episode, and observed.
 
-The threat function does not depend on x, so one Q-network may learn the P-MDPs of all x at once.
+Since the threat function does not depend on x, one Q-network can learn the P-MDPs of all x at once.
 """
 
 from dataclasses import dataclass
@@ -11,76 +11,90 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rp_jax.envs.base import Env, Hazards, Outcome
+from rp_jax.envs import optional
+from rp_jax.envs.contract import Env, Hazards, Outcome
 from rp_jax.hazards import SubRMDP
 from rp_jax.planning.pmdp import PMDP
+from rp_jax.shield import rounded_down
 from rp_jax.validate import number
 
 
 class State(struct.PyTreeNode):
-    """A state of the environment, and the threshold of its episode."""
+    """A state of the environment, with the threshold of its episode."""
 
-    inner: Any
-    x: Array  # ()
+    inner: Any  # the environment's state
+    x: Array  # () threshold
 
     @property
-    def agent(self) -> Any:
-        """The agent of the environment's state."""
-        return self.inner.agent
+    def body(self) -> Any:
+        """The body's state."""
+        return self.inner.body
 
     @property
     def time(self) -> Array:
-        """() int32, steps since the start."""
+        """The number of steps since the start, () int32."""
         return self.inner.time
 
 
 class Params(struct.PyTreeNode):
-    """The environment's parameters, and the range of x."""
+    """The environment's parameters, with the range of x."""
 
-    inner: Any
+    inner: Any  # the environment's parameters
     low: Array  # () least x
     high: Array  # () greatest x
 
     @property
-    def agent(self) -> Any:
-        """The agent model of the environment."""
-        return self.inner.agent
+    def body(self) -> Any:
+        """The body's model."""
+        return self.inner.body
 
     @property
     def time_limit(self) -> Array:
-        """() int32, steps of an episode at most."""
+        """The number of steps of an episode, () int32."""
         return self.inner.time_limit
 
 
 def make_params(inner: Any, low: float, high: float) -> Params:
-    """Thresholds spread evenly over the orders of magnitude from `low` to `high`.
+    """Returns parameters with thresholds spread evenly over the orders of magnitude of a range.
+
+    Args:
+        inner: the environment's parameters.
+        low: least threshold, greater than 0.
+        high: greatest threshold.
 
     Raises:
-        ValueError: not 0 < low <= high.
+        ValueError: 0 < low <= high does not hold.
     """
     number("low", low, above=0)
     number("high", high, least=low)
-    return Params(inner, jnp.asarray(low, float), jnp.asarray(high, float))
+    least, most = (jnp.asarray(rounded_down(x), float) for x in (low, high))
+    return Params(inner, least, most)
 
 
 @dataclass(frozen=True)
 class Conditioned:
-    """An environment (`rp_jax.envs.base.Env`) whose states and observations carry x."""
+    """An environment (`rp_jax.envs.Env`) whose states and observations include the threshold x."""
 
-    env: Env
+    env: Env  # the environment without x
 
     @property
     def LIDAR_BINS(self) -> int:  # noqa: N802
-        """See `Env`."""
-        return self.env.LIDAR_BINS
+        """How many of an observation's first values are distances of a LIDAR."""
+        return optional.lidar_bins(self.env)
 
     @property
     def SCALE(self) -> tuple[float, ...]:  # noqa: N802
-        """See `Env`; the last is that of log10 x."""
-        return (*self.env.SCALE, 0.5)
+        """The factors of the rest of an observation, for learners; the last is that of log10 x."""
+        scale = optional.scale(self.env)
+        return (*scale, 0.5) if scale else ()
 
     def reset(self, key: Array, params: Params) -> State:
-        """Draws a start and a threshold."""
+        """Draws a start and a threshold.
+
+        Args:
+            key: random key.
+            params: the parameters.
+        """
         start, draw = jax.random.split(key)
         low, high = jnp.log(params.low), jnp.log(params.high)
         x = jnp.exp(low + jax.random.uniform(draw, (), low.dtype) * (high - low))
@@ -90,57 +104,91 @@ class Conditioned:
     def step(
         self, key: Array, state: State, action: Array, params: Params
     ) -> tuple[State, Outcome]:
-        """One transition of the environment."""
+        """Makes one transition of the environment; the threshold stays the same.
+
+        Args:
+            key: random key.
+            state: the state before.
+            action: () int, or floats where actions are continuous.
+            params: the parameters.
+
+        Returns:
+            The state after, and the step's outcome.
+        """
         inner, outcome = self.env.step(key, state.inner, action, params.inner)
         return state.replace(inner=inner), outcome
 
+    def threshold(self, state: State) -> Array:
+        """Returns the largest admissible threat of a state's episode, ().
+
+        Args:
+            state: the state.
+        """
+        return state.x
+
     def observe(self, state: State, params: Params) -> Array:
-        """The environment's observation, and log10 x."""
+        """Returns the environment's observation, with log10 x appended.
+
+        Args:
+            state: the state.
+            params: the parameters.
+        """
         seen = self.env.observe(state.inner, params.inner)
         return jnp.concatenate([seen, jnp.log10(state.x)[None].astype(seen.dtype)])
 
     def hazards(self, state: State, params: Params) -> dict[str, Hazards]:
-        """See `Env`."""
+        """Returns, by kind, the hazards that `sub_rmdps` has threats for.
+
+        Args:
+            state: the state.
+            params: the parameters.
+        """
         return self.env.hazards(state.inner, params.inner)
 
-    def causes(self, state: State, params: Params) -> dict[str, Array]:
-        """See `Env`."""
-        return self.env.causes(state.inner, params.inner)
+    def collisions(self, state: State, params: Params) -> dict[str, Array]:
+        """Returns, by kind, whether a hazard is being hit, () bool each.
+
+        Args:
+            state: the state.
+            params: the parameters.
+        """
+        return optional.collisions(self.env, state.inner, params.inner)
 
     def clearance(self, position: Array, params: Params) -> Array:
-        """See `Env`."""
-        return self.env.clearance(position, params.inner)
+        """Returns the distance left between the body and the nearest fixed hazard, () room units.
+
+        Args:
+            position: (2,) of the body.
+            params: the parameters.
+        """
+        return optional.clearance(self.env, position, params.inner)
 
     def sub_rmdps(self, params: Params) -> dict[str, SubRMDP]:
-        """See `Env`."""
+        """Returns, by kind, the sub-R-MDP of the body and one hazard.
+
+        Args:
+            params: the parameters.
+        """
         return self.env.sub_rmdps(params.inner)
 
     def num_actions(self, params: Params) -> int:
-        """See `Env`."""
-        return self.env.num_actions(params.inner)
+        """Returns the size of the discrete action set.
+
+        Args:
+            params: the parameters.
+        """
+        return optional.num_actions(self.env, params.inner)
 
 
-class ConditionedPMDP(PMDP):
-    """Equation 10 with each episode's own threshold: threats are in units of x, which is 1."""
+def condition(pmdp: PMDP, low: float, high: float) -> PMDP:
+    """Returns the P-MDPs of all thresholds in a range as one.
 
-    def threat(self, states: State, alive: Array | None = None) -> Array:
-        """(B, A) total threat over x; rounded up, so that nothing is admitted for rounding."""
-        ratio = super().threat(states, alive) / states.x[:, None]
-        return ratio * (1 + float(jnp.finfo(ratio.dtype).eps))
+    Args:
+        pmdp: the P-MDP of any threshold.
+        low: least threshold, greater than 0.
+        high: greatest threshold.
 
-    def _threshold(self, states: State) -> Array:
-        return states.x
-
-
-def condition(pmdp: PMDP, low: float, high: float) -> ConditionedPMDP:
-    """The P-MDPs of all thresholds from `low` to `high` in one."""
-    return ConditionedPMDP(
-        params=make_params(pmdp.params, low, high),
-        threats=pmdp.threats,
-        x=jnp.ones_like(pmdp.x),
-        penalty=pmdp.penalty,
-        toll=pmdp.toll,
-        env=Conditioned(pmdp.env),
-        pool=pmdp.pool,
-        lookahead=pmdp.lookahead,
-    )
+    Raises:
+        ValueError: 0 < low <= high does not hold.
+    """
+    return pmdp.replace(params=make_params(pmdp.params, low, high), env=Conditioned(pmdp.env))

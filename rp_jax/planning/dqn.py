@@ -11,33 +11,33 @@ from flax import linen as nn
 from jax import Array
 
 from rp_jax import shield
-from rp_jax.planning.pmdp import Encoded
+from rp_jax.planning.percept import Encoded
 from rp_jax.validate import number
 
 
 class Transition(NamedTuple):
-    """One item of the replay: n steps from a state, and what is admissible where they led."""
+    """An item of the replay buffer: n steps from a state, and the state that they led to."""
 
-    encoded: Encoded
-    action: Array  # () int32
-    reward: Array  # () discounted sum over the n steps
-    discount: Array  # () gamma^n, 0 after a true end
-    next_encoded: Encoded
-    next_admissible: Array  # (W,) uint32, `shield.to_bits`
+    encoded: Encoded  # observation of the first state
+    action: Array  # () int32, first action
+    reward: Array  # () discounted sum of the rewards of the n steps
+    discount: Array  # () gamma^n; 0 where a terminal state was reached
+    next_encoded: Encoded  # observation of the last state
+    next_admissible: Array  # (A,) bool, the admissible actions of the last state
 
 
 @dataclass(frozen=True)
 class DQNConfig:
     """Hyperparameters of the learner."""
 
-    gamma: float = 0.95
-    learning_rate: float = 3e-3
-    epsilon: float = 1e-8  # Adam's
-    anneal: bool = True  # learning rate falls to a tenth
-    polyak: float = 0.01  # 0: copy every `period`
-    period: int = 1000  # updates between copies
-    reward_scale: float = 0.1
-    masked_target: bool = True  # maximum over admissible actions; False: over all
+    gamma: float = 0.95  # discount of reward
+    learning_rate: float = 3e-3  # Adam's learning rate
+    epsilon: float = 1e-8  # Adam's epsilon
+    anneal: bool = True  # let the learning rate fall to a tenth
+    polyak: float = 0.01  # step size of the target network; 0: copy it every `period` updates
+    period: int = 1000  # updates between copies of the target network
+    reward_scale: float = 0.1  # factor of the rewards
+    masked_target: bool = True  # maximum over admissible actions; False: over all actions
 
     def validate(self, name: str) -> None:
         """Raises ValueError, naming the field after `name`, if a value is out of range."""
@@ -50,32 +50,42 @@ class DQNConfig:
 
 
 class Learner(NamedTuple):
-    """Carried through learning."""
+    """The state of the learner between two updates."""
 
-    params: Any
-    target: Any
-    opt_state: optax.OptState
-    updates: Array  # () int32
+    params: Any  # weights of the Q-network
+    target: Any  # weights of the target network
+    opt_state: optax.OptState  # state of the optimiser
+    updates: Array  # () int32, number of updates made
 
 
 def double_q_target(
     reward: Array, discount: Array, online: Array, target: Array, admissible: Array
 ) -> Array:
-    """() r + gamma Q'(s', argmax_{a' in A(s')} Q(s', a')): Algorithm 4, lines 5 to 10.
+    """Returns the target of Double Q-learning inside the admissible set (Algorithm 4).
+
+    Lines 5 to 10: r + gamma Q'(s', argmax_{a' in A(s')} Q(s', a')).
 
     Args:
-        reward: () of the step(s) to s'.
-        discount: () 0 where s' is terminal.
-        online: (A,) Q(s', .) that chooses.
-        target: (A,) Q'(s', .) that values.
-        admissible: (A,) bool; greedy-eta alone where s' is not secure.
+        reward: () reward r of the step or steps to s'.
+        discount: () gamma to the power of their number; 0 where s' is terminal.
+        online: (A,) Q(s', .), which chooses the action.
+        target: (A,) Q'(s', .), which gives its value.
+        admissible: (A,) bool, the admissible actions A(s').
+
+    Returns:
+        ().
     """
     chex.assert_rank([reward, discount, online, target, admissible], [0, 0, 1, 1, 1])
     return reward + discount * target[shield.masked_argmax(online, admissible)]
 
 
 def optimiser(config: DQNConfig, updates: int) -> optax.GradientTransformation:
-    """Adam, whose rate may fall over so many updates."""
+    """Returns Adam, whose learning rate may fall over the updates.
+
+    Args:
+        config: hyperparameters; with `anneal` the rate falls to a tenth along a cosine.
+        updates: number of updates over which it falls.
+    """
     rate = config.learning_rate
     schedule = optax.cosine_decay_schedule(rate, updates, alpha=0.1)
     return optax.adam(schedule if config.anneal else rate, eps=config.epsilon)
@@ -84,7 +94,14 @@ def optimiser(config: DQNConfig, updates: int) -> optax.GradientTransformation:
 def init(
     key: Array, network: nn.Module, transform: optax.GradientTransformation, encoded: Encoded
 ) -> Learner:
-    """A fresh learner; `encoded` is any example."""
+    """Returns a new learner, whose target network equals its Q-network.
+
+    Args:
+        key: random key for the weights.
+        network: the Q-network.
+        transform: the optimiser.
+        encoded: any observation, for the shapes.
+    """
     params = network.init(key, encoded)
     target = jax.tree.map(jnp.copy, params)
     return Learner(params, target, transform.init(params), jnp.asarray(0, jnp.int32))
@@ -98,22 +115,22 @@ def update(
     weights: Array,
     config: DQNConfig,
 ) -> tuple[Learner, Array, Array]:
-    """One gradient step.
+    """Makes one gradient step.
 
     Args:
-        learner: before the step.
-        network: of the action values.
-        transform: from `optimiser`.
-        batch: transitions with leading axis (B,).
-        weights: (B,) of the samples, 1 unless the replay is prioritised.
+        learner: the learner before the step.
+        network: the Q-network.
+        transform: the optimiser, from `optimiser`.
+        batch: transitions, leading axis (B,).
+        weights: (B,) weights of the transitions; 1 unless the replay is prioritised.
         config: hyperparameters.
 
     Returns:
-        (learner, loss, errors): the mean Huber loss and the temporal-difference errors (B,).
+        The learner after the step, the mean Huber loss (), and the temporal-difference errors (B,).
     """
     online = jnp.asarray(network.apply(learner.params, batch.next_encoded))
     target = jnp.asarray(network.apply(learner.target, batch.next_encoded))
-    admissible = jax.vmap(shield.from_bits, (0, None))(batch.next_admissible, online.shape[-1])
+    admissible = batch.next_admissible
     if not config.masked_target:
         admissible = jnp.ones_like(admissible)
     reward = batch.reward * config.reward_scale

@@ -12,12 +12,13 @@ from flax import linen as nn
 from jax import Array
 
 from rp_jax import shield
-from rp_jax.envs import base
+from rp_jax.envs import autoreset, optional, tally
 from rp_jax.planning import dqn
 from rp_jax.planning.dqn import DQNConfig, Learner, Transition
 from rp_jax.planning.networks import NETWORKS
 from rp_jax.planning.nstep import Taken, n_step_transition
-from rp_jax.planning.pmdp import PMDP, Encoded, faults
+from rp_jax.planning.percept import Encoded, faults
+from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import finite, none_bad, number, one_of, random_key
 
 
@@ -27,7 +28,7 @@ class LoopConfig:
 
     network: str = "tuned"
     learner: DQNConfig = field(default_factory=DQNConfig)
-    steps: int = 600_000  # agent steps in all
+    steps: int = 1_200_000  # agent steps in all
     num_envs: int = 256
     batch: int = 1024
     updates: int = 1  # per step of all environments
@@ -65,9 +66,14 @@ class LoopConfig:
         return -(-self.steps // self.num_envs)
 
     @property
+    def opening(self) -> int:
+        """Iterations that fill the windows, before anything is kept in the replay."""
+        return self.n_step - 1
+
+    @property
     def filling(self) -> int:
-        """Iterations before learning begins: they fill the windows, then the replay."""
-        return self.n_step - 1 + -(-self.replay_start // self.num_envs)
+        """Iterations that fill the replay before learning begins."""
+        return -(-self.replay_start // self.num_envs)
 
     @property
     def samples_per_step(self) -> float:
@@ -97,7 +103,9 @@ class Seen(NamedTuple):
 
     encoded: Encoded  # (B,)
     threat: Array  # (B, A)
-    bits: Array  # (B, W) uint32, admissible actions
+    admissible: Array  # (B, A) bool
+    secure: Array  # (B,) bool, some action is admissible by its threat
+    threshold: Array  # (B,) largest admissible threat
 
 
 class LoopState(NamedTuple):
@@ -105,7 +113,7 @@ class LoopState(NamedTuple):
 
     states: Any  # (B,) environment states
     seen: Seen  # of those states
-    running: base.Running  # (B,) episodes
+    running: tally.Running  # (B,) episodes
     window: Taken  # (n_step, B), oldest first
     learner: Learner
     replay: Any
@@ -115,8 +123,8 @@ class LoopState(NamedTuple):
 
 def make_network(config: LoopConfig, pmdp: PMDP) -> nn.Module:
     """The Q-network that the configuration names."""
-    num_actions = pmdp.env.num_actions(pmdp.params)
-    return NETWORKS[config.network](num_actions=num_actions, scale=pmdp.env.SCALE)
+    num_actions = optional.num_actions(pmdp.env, pmdp.params)
+    return NETWORKS[config.network](num_actions=num_actions, scale=optional.scale(pmdp.env))
 
 
 def make_optimiser(config: LoopConfig) -> optax.GradientTransformation:
@@ -145,20 +153,19 @@ def exploration(iteration: Array, config: LoopConfig) -> Array:
     return config.explore_from + done * (config.explore_to - config.explore_from)
 
 
-def _choose(key: Array, values: Array, bits: Array, epsilon: Array) -> Array:
+def _choose(key: Array, values: Array, admissible: Array, epsilon: Array) -> Array:
     """() int32, epsilon-greedy inside the admissible set."""
     explore, pick = jax.random.split(key)
-    mask = shield.from_bits(bits, values.shape[-1])
-    greedy = shield.masked_argmax(values, mask)
-    random = shield.masked_sample(pick, mask)
+    greedy = shield.masked_argmax(values, admissible)
+    random = shield.masked_sample(pick, admissible)
     action = jnp.where(jax.random.bernoulli(explore, epsilon), random, greedy)
     return action.astype(jnp.int32)
 
 
 def _look(pmdp: PMDP, states: Any) -> Seen:
     percept = pmdp.perceive(states)
-    bits = jax.vmap(shield.to_bits)(percept.admissible)
-    return Seen(encoded=percept.encoded, threat=percept.threat, bits=bits)
+    encoded, admissible, secure, threat, threshold = percept
+    return Seen(encoded, threat, admissible, secure, threshold)
 
 
 def interact(
@@ -170,8 +177,8 @@ def interact(
     values = jnp.asarray(network.apply(state.learner.params, state.seen.encoded))
     epsilon = exploration(state.iteration, config)
     keys = jax.random.split(choose_key, batch)
-    action = jax.vmap(_choose, (0, 0, 0, None))(keys, values, state.seen.bits, epsilon)
-    carried, (_, seen), outcome = base.step_and_renew(
+    action = jax.vmap(_choose, (0, 0, 0, None))(keys, values, state.seen.admissible, epsilon)
+    carried, (_, seen), outcome = autoreset.step_and_renew(
         pmdp.env,
         jax.random.split(step_key, batch),
         state.states,
@@ -179,24 +186,24 @@ def interact(
         pmdp.params,
         functools.partial(_look, pmdp),
     )
-    insecure = (jnp.min(seen.threat, axis=-1) > pmdp.x) & ~outcome.terminated
+    insecure = ~seen.secure & ~outcome.terminated
     taken = Taken(
         encoded=state.seen.encoded,
         action=action,
-        reward=outcome.reward - pmdp.penalty * outcome.danger - pmdp.toll * insecure,
+        reward=outcome.reward - pmdp.penalty * outcome.danger - pmdp.insecure_penalty * insecure,
         terminated=outcome.terminated,
         done=outcome.done,
         next_encoded=seen.encoded,
-        next_admissible=seen.bits,
+        next_admissible=seen.admissible,
     )
-    running, ended = base.tally(state.running, outcome)
+    running, ended = tally.tally(state.running, outcome)
     dtype = ended.score.dtype
     bad_observation, bad_threat = faults(state.seen.encoded, state.seen.threat)
     metrics = Metrics(
         steps=jnp.asarray(batch, dtype),
         **ended._asdict(),
-        insecure=jnp.sum(jnp.min(state.seen.threat, axis=-1) > pmdp.x, dtype=dtype),
-        inadmissible=jnp.sum(_inadmissible(state.seen.threat, action, pmdp.x), dtype=dtype),
+        insecure=jnp.sum(~state.seen.secure, dtype=dtype),
+        inadmissible=jnp.sum(_inadmissible(state.seen, action), dtype=dtype),
         loss=jnp.zeros((), dtype),
         bad_observations=jnp.sum(bad_observation, dtype=dtype),
         bad_threats=jnp.sum(bad_threat, dtype=dtype),
@@ -209,10 +216,11 @@ def interact(
     return state, metrics
 
 
-def _inadmissible(threat: Array, action: Array, x: Array) -> Array:
+def _inadmissible(seen: Seen, action: Array) -> Array:
     """(B,) bool, checked against the threats themselves and not against the mask."""
-    taken = jnp.take_along_axis(threat, action[:, None], axis=-1)[:, 0]
-    least = jnp.min(threat, axis=-1)
+    taken = jnp.take_along_axis(seen.threat, action[:, None], axis=-1)[:, 0]
+    least = jnp.min(seen.threat, axis=-1)
+    x = seen.threshold
     return ~((taken <= x) | ((least > x) & (taken <= least)))
 
 
@@ -230,16 +238,16 @@ def begin(key: Array, pmdp: PMDP, config: LoopConfig) -> LoopState:
     resets = jax.random.split(reset_key, batch)
     states = jax.vmap(pmdp.env.reset, (0, None))(resets, pmdp.params)
     seen = _look(pmdp, states)
-    encoded, threat, bits = seen
+    encoded, threat, admissible, *_ = seen
     zeros = jnp.zeros(batch, threat.dtype)
     false = jnp.zeros(batch, bool)
-    taken = Taken(encoded, jnp.zeros(batch, jnp.int32), zeros, false, false, encoded, bits)
+    taken = Taken(encoded, jnp.zeros(batch, jnp.int32), zeros, false, false, encoded, admissible)
     window = jax.tree.map(lambda a: jnp.stack([a] * config.n_step), taken)
     example = _oldest(window, config)
     return LoopState(
         states=states,
         seen=seen,
-        running=base.Running(zeros, zeros),
+        running=tally.Running(zeros, zeros),
         window=window,
         learner=dqn.init(net_key, network, make_optimiser(config), encoded),
         replay=replay.init(jax.tree.map(lambda a: a[0], example)),
@@ -249,8 +257,24 @@ def begin(key: Array, pmdp: PMDP, config: LoopConfig) -> LoopState:
 
 
 def init(key: Array, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics]:
-    """`begin`, and a replay filled up to `replay_start` by real steps."""
-    return chunk(begin(key, pmdp, config), pmdp, config, config.filling, updates=0)
+    """Returns `begin` with a replay filled by real steps, and the metrics of these."""
+    state, opening = begin(key, pmdp, config), None
+    if config.opening:
+        state, opening = chunk(state, pmdp, config, config.opening, updates=0)
+        state = emptied(state, config)
+    state, metrics = chunk(state, pmdp, config, config.filling, updates=0)
+    return state, metrics if opening is None else jax.tree.map(jnp.add, opening, metrics)
+
+
+def emptied(state: LoopState, config: LoopConfig) -> LoopState:
+    """Returns the state with nothing in the replay: what half-filled windows left there is no use.
+
+    Args:
+        state: after `config.opening` iterations.
+        config: of the loop.
+    """
+    example = jax.tree.map(lambda a: a[0], _oldest(state.window, config))
+    return state._replace(replay=make_replay(config).init(example))
 
 
 def _oldest(window: Taken, config: LoopConfig) -> Transition:
@@ -258,26 +282,12 @@ def _oldest(window: Taken, config: LoopConfig) -> Transition:
     return jax.vmap(n_step_transition, (1, None))(window, config.learner.gamma)
 
 
-def _store(state: LoopState, config: LoopConfig) -> Any:
-    """The replay with the windows' oldest steps; while windows fill, the next ones replace them."""
-    old = state.replay
-    new = make_replay(config).add(old, _oldest(state.window, config))
-    if config.n_step == 1:
-        return new
-    filling = state.iteration < 0
-    places = ["current_index", "is_full"]
-    if config.prioritised:
-        places.append("running_index")  # of the priorities
-    back = {name: jnp.where(filling, getattr(old, name), getattr(new, name)) for name in places}
-    return new.replace(**back)
-
-
 def collect(state: LoopState, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics]:
     """Act, step, look, store: one step of every environment."""
     key, act_key = jax.random.split(state.key)
     network = make_network(config, pmdp)
     state, metrics = interact(act_key, state, pmdp, network, config)
-    stored = _store(state, config)
+    stored = make_replay(config).add(state.replay, _oldest(state.window, config))
     return state._replace(replay=stored, key=key, iteration=state.iteration + 1), metrics
 
 

@@ -4,13 +4,23 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jax import Array
 
-from rp_jax.planning.pmdp import Encoded
+from rp_jax.planning.percept import Encoded
 
 
 def features(seen: Encoded, scale: tuple[float, ...]) -> Array:
-    """(..., L + R) all that is seen, of the order of 1: nearness, 0 where nothing is, and rest."""
+    """Returns all that is observed as one array with values of the order of 1.
+
+    Args:
+        seen: observations, leading axes (...).
+        scale: factors of the values beside the LIDAR; () stands for ones.
+
+    Returns:
+        (..., L + R) 1 - distance for each LIDAR bin (0 where nothing is seen), then the scaled
+        rest.
+    """
     scan = 1.0 - seen.scan.astype(seen.rest.dtype) / 255
-    factors = jnp.broadcast_to(jnp.asarray(scale, seen.rest.dtype), seen.rest.shape)
+    factors = jnp.asarray(scale or (1.0,) * seen.rest.shape[-1], seen.rest.dtype)
+    factors = jnp.broadcast_to(factors, seen.rest.shape)
     return jnp.concatenate([scan, seen.rest * factors], axis=-1)
 
 
@@ -18,12 +28,19 @@ class TunedNetwork(nn.Module):
     """A perceptron on the pooled LIDAR and the rest of the observation."""
 
     num_actions: int
-    scale: tuple[float, ...]  # (R,) brings the rest of the observation to the order of 1
-    hidden: tuple[int, ...] = (128, 64)
+    scale: tuple[float, ...]  # factors that bring the values beside the LIDAR to the order of 1
+    hidden: tuple[int, ...] = (128, 64)  # widths of the hidden layers
 
     @nn.compact
     def __call__(self, seen: Encoded) -> Array:
-        """(..., A) action values."""
+        """Returns the values of all actions.
+
+        Args:
+            seen: observations, leading axes (...).
+
+        Returns:
+            (..., A).
+        """
         x = features(seen, self.scale)
         for width in self.hidden:
             x = nn.silu(nn.Dense(width)(x))
@@ -31,19 +48,29 @@ class TunedNetwork(nn.Module):
 
 
 class PaperNetwork(nn.Module):
-    """Appendix G.1: convolution (3 channels, kernel 6) and max pooling (8) of the LIDAR, then
-    50-20 tanh units; without a LIDAR 50-50."""
+    """The Q-network of the paper (appendix G.1).
+
+    A convolution (3 channels, kernel 6) and max pooling (8) of the LIDAR, then 50-20 tanh units;
+    without a LIDAR 50-50.
+    """
 
     num_actions: int
     scale: tuple[float, ...]  # not used: the paper feeds raw values
 
     @nn.compact
     def __call__(self, seen: Encoded) -> Array:
-        """(..., A) action values."""
+        """Returns the values of all actions.
+
+        Args:
+            seen: observations, leading axes (...).
+
+        Returns:
+            (..., A).
+        """
         x, lidar = seen.rest, seen.scan.shape[-1] > 0
         if lidar:
             scan = seen.scan.astype(x.dtype) / 255
-            scan = jnp.where(scan == 1.0, 0.0, scan)  # the paper's scans say 0 for nothing seen
+            scan = jnp.where(scan == 1.0, 0.0, scan)  # in the paper, 0 means that nothing is seen
             pooled = _convolve_and_pool(
                 scan,
                 self.param("kernel", nn.initializers.lecun_normal(), (6, 3)),
@@ -56,9 +83,10 @@ class PaperNetwork(nn.Module):
 
 
 def _convolve_and_pool(scan: Array, kernel: Array, bias: Array) -> Array:
-    """Convolution along (..., L) with a kernel (width, channels), relu, and maxima over 8 places.
+    """Returns a convolution along (..., L), after relu and max pooling over 8 places.
 
-    The last pool may be partly filled, as in the original's framework. Sums of shifted scans, one
+    The kernel is (width, channels), and the channels of the result lie one after another. The last
+    pool may be partly filled, as in the framework of the original code. Sums of shifted scans, one
     channel at a time, run seven times faster on a CPU than XLA's convolution of a single channel.
     """
     width, channels = kernel.shape
@@ -74,4 +102,4 @@ def _convolve_and_pool(scan: Array, kernel: Array, bias: Array) -> Array:
 
 
 NETWORKS = {"tuned": TunedNetwork, "paper": PaperNetwork}
-POOLS = {"tuned": 8, "paper": 1}  # LIDAR bins pooled before the network
+POOLS = {"tuned": 8, "paper": 1}  # number of LIDAR bins pooled into one before the network

@@ -1,4 +1,4 @@
-"""Returns over several steps, from a window over the last ones of each environment."""
+"""Multi-step returns, from a window over the last steps of each environment."""
 
 from typing import NamedTuple
 
@@ -7,25 +7,27 @@ import jax.numpy as jnp
 from jax import Array
 
 from rp_jax.planning.dqn import Transition
-from rp_jax.planning.pmdp import Encoded
+from rp_jax.planning.percept import Encoded
 
 
 class Taken(NamedTuple):
-    """One step of every environment, as the n-step window keeps it."""
+    """One step of every environment, as the window keeps it."""
 
-    encoded: Encoded
-    action: Array  # (B,)
-    reward: Array  # (B,) penalty and toll included
-    terminated: Array  # (B,)
-    done: Array  # (B,)
-    next_encoded: Encoded
-    next_admissible: Array  # (B, W) bits
+    encoded: Encoded  # (B,) observations before the step
+    action: Array  # (B,) int32
+    reward: Array  # (B,) rewards, penalties included
+    terminated: Array  # (B,) bool, a terminal state was reached
+    done: Array  # (B,) bool, the episode ended, perhaps by the time limit
+    next_encoded: Encoded  # (B,) observations after the step
+    next_admissible: Array  # (B, A) bool, the admissible actions after the step
 
 
 def n_step_transition(window: Taken, gamma: float) -> Transition:
-    """The transition from the window's first step to its last, or to the first end in it.
+    """Returns the transition from a window's first state to its last, or to an episode's end in it.
 
-    `window` is of a single environment: leading axis (n,).
+    Args:
+        window: n steps of a single environment, the oldest first; leading axis (n,).
+        gamma: discount of reward.
     """
     n = window.reward.shape[0]
     before = jnp.cumsum(window.done) - window.done == 0  # no end before this step

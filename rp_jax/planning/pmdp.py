@@ -1,6 +1,6 @@
-"""The P-MDP as a learner meets it: an environment, threats, a threshold, and what is seen."""
+"""The P-MDP as a learner meets it: an environment, its threats, and a threshold."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,84 +8,99 @@ from flax import struct
 from jax import Array
 
 from rp_jax import shield
-from rp_jax.envs.base import Env, renew
-from rp_jax.kinematics import Plans
+from rp_jax.arrays import renew
+from rp_jax.dynamics import Plans
+from rp_jax.envs import optional
+from rp_jax.envs.contract import Env, Outcome
+from rp_jax.planning.percept import Percept, encode
 from rp_jax.threat.model import ThreatModel
 from rp_jax.threat.static import bounded, plan_clearance, static_threat
 from rp_jax.threat.total import total_threat
 
-OUTCOMES = 0x100C  # seed of the outcomes looked at; no environment's keys come from it
-
-
-class Encoded(NamedTuple):
-    """An observation as it is stored: the LIDAR in bytes, the rest as it is."""
-
-    scan: Array  # (..., L) uint8; 255 where nothing is seen
-    rest: Array  # (..., R) float
-
-
-class Percept(NamedTuple):
-    """All that a policy may know of a batch of states."""
-
-    encoded: Encoded
-    admissible: Array  # (B, A) bool
-    secure: Array  # (B,) bool
-    threat: Array  # (B, A)
-
-
-def faults(encoded: Encoded, threat: Array) -> tuple[Array, Array]:
-    """(B,) bool each: an observation (B, ...), or the threats (B, A), hold a number that is none.
-
-    What is not floating point cannot.
-    """
-    seen = [leaf for leaf in jax.tree.leaves(encoded) if leaf.dtype.kind == "f"]
-    bad = [not_finite(leaf.reshape(len(leaf), -1)) for leaf in seen]
-    return jnp.any(jnp.stack(bad), axis=0), not_finite(threat)
-
-
-def not_finite(values: Array) -> Array:
-    """(B, n) -> (B,) bool."""
-    return ~jnp.all(jnp.isfinite(values), axis=-1)
+OUTCOMES = 0x100C  # seed for sampled outcomes of actions; no environment's keys come from it
 
 
 class PMDP(struct.PyTreeNode):
-    """Equation 10: the original MDP, restricted to the admissible actions.
+    """The planning MDP: the original MDP, restricted to the admissible actions (equation 10).
 
-    A penalised MDP without a shield is the same with x = infinity and a penalty; with None for
-    threats, none is computed.
+    An action is admissible if its threat is at most x. A state without such an action is called
+    insecure; in it only the least threatening action is admissible. With `shielded=False` no threat
+    is computed and every action is admissible: an MDP with nothing but a penalty on danger.
     """
 
-    params: Any  # of the environment
-    threats: dict[str, ThreatModel] | None  # by kind of hazard; None: nothing is ever forbidden
-    x: Array  # () threshold of admissible threat
-    penalty: Array  # () taken off the reward per unit of danger while learning
-    toll: Array  # () likewise, per state reached in which no action is admissible
-    env: Env = struct.field(pytree_node=False)
-    pool: int = struct.field(pytree_node=False, default=8)  # LIDAR bins seen as one
-    lookahead: int = struct.field(pytree_node=False, default=0)  # outcomes of each action that are
-    # looked at where no action is admissible by the threats of this state alone
+    params: Any  # the environment's parameters
+    threats: dict[str, ThreatModel]  # models by kind of hazard; empty under plans if all are fixed
+    x: Array  # () threshold: greatest admissible threat
+    penalty: Array  # () subtracted from the reward per unit of danger while learning
+    insecure_penalty: Array  # () subtracted for each insecure state that is reached
+    env: Env = struct.field(pytree_node=False)  # the environment
+    pool: int = struct.field(pytree_node=False, default=8)  # number of LIDAR bins pooled into one
+    lookahead: int = struct.field(pytree_node=False, default=0)  # outcomes sampled of each action
+    # where a state's own threats admit none; 0: no look-ahead
+    shielded: bool = struct.field(pytree_node=False, default=True)  # False: all is admissible
+
+    @property
+    def num_actions(self) -> int:
+        """The size of the discrete action set."""
+        return optional.num_actions(self.env, self.params)
 
     def perceive(self, states: Any, alive: Array | None = None) -> Percept:
-        """Observes a batch of states and finds what is admissible in them.
+        """Observes a batch of states, and finds the actions that are admissible in them.
 
-        Where `alive` (B,) is false, no threat is computed.
+        Args:
+            states: states, leading axis (B,).
+            alive: (B,) bool; where it is False, no threat is computed.
         """
         observation = jax.vmap(self.env.observe, (0, None))(states, self.params)
-        encoded = jax.vmap(encode, (0, None, None))(observation, self.env.LIDAR_BINS, self.pool)
+        bins = optional.lidar_bins(self.env)
+        encoded = jax.vmap(encode, (0, None, None))(observation, bins, self.pool)
         threat = self.threat(states, alive)
-        mask, secure = jax.vmap(shield.shield, (0, None))(threat, self.x)
-        return Percept(encoded, mask, secure, threat)
+        threshold = self.thresholds(states)
+        mask, secure = jax.vmap(shield.shield)(threat, threshold)
+        return Percept(encoded, mask, secure, threat, threshold)
+
+    def thresholds(self, states: Any) -> Array:
+        """Returns the largest admissible threat in each state, (B,).
+
+        It is `x`, unless the environment has a function `threshold(state)`.
+
+        Args:
+            states: states, leading axis (B,).
+        """
+        if hasattr(self.env, "threshold"):
+            return jax.vmap(self.env.threshold)(states)
+        return jnp.broadcast_to(self.x, states.time.shape)
+
+    def advance(self, keys: Array, states: Any, actions: Array) -> tuple[Any, Outcome]:
+        """Makes one transition of each state of a batch.
+
+        Args:
+            keys: (B,) random keys for the environment.
+            states: states, leading axis (B,).
+            actions: (B,) int, or (B, D) float where they are continuous.
+
+        Returns:
+            The states after, and the outcomes of the step.
+        """
+        return jax.vmap(self.env.step, (0, 0, 0, None))(keys, states, actions, self.params)
 
     def threat(self, states: Any, alive: Array | None = None) -> Array:
-        """(B, A) total threat of a batch of states, 0 where not `alive`.
+        """Returns the total threats of a batch of states.
 
-        With `lookahead`, where no action is admissible by the sum over hazards, the lesser of it
-        and of its Bellman backup, an upper function as well (docs/theory.md).
+        With `lookahead`, in insecure states it is the lesser of the sum over hazards and its
+        Bellman backup, which is an upper bound of the danger as well (docs/theory.md).
+
+        Args:
+            states: states, leading axis (B,).
+            alive: (B,) bool; where it is False, the threats are 0.
+
+        Returns:
+            (B, A).
         """
-        if self.threats is None:
-            shape = (states.time.shape[0], self.env.num_actions(self.params))
+        if not self.shielded:
+            shape = (states.time.shape[0], self.num_actions)
             return jnp.zeros(shape, self.x.dtype)
-        summed = self._summed(states, self._static(states.agent), alive)
+        summed = self._summed(states, self._static(states.body), alive)
         if self.lookahead == 0:
             return summed
 
@@ -93,28 +108,28 @@ class PMDP(struct.PyTreeNode):
             chosen = jax.tree.map(lambda a: a.at[rows].get(mode="clip"), states)
             return jnp.minimum(summed.at[rows].get(mode="clip"), self._backup(chosen))
 
-        insecure = jnp.min(summed, axis=-1) > self._threshold(states)
+        insecure = jnp.min(summed, axis=-1) > self.thresholds(states)
         return renew(insecure, summed, closer, chunk=4)
 
-    def _threshold(self, states: Any) -> Array:
-        """() or (B,) what `threat` is compared with."""
-        return self.x
-
-    def _static(self, agents: Any) -> Array | None:
-        """(B, K, A) joint threat of the fixed hazards, by plan; None without plans."""
-        model = self.params.agent
+    def _static(self, bodies: Any) -> Array | None:
+        """Returns the joint threats of the fixed hazards by plan, (B, K, A); None without plans."""
+        model = self.params.body
         if not isinstance(model.baseline, Plans):
             return None
-        clearance = lambda position: self.env.clearance(position, self.params)  # noqa: E731
-        return static_threat(
-            jax.vmap(lambda agent: plan_clearance(agent, model, clearance))(agents)
-        )
+        clearance = lambda position: optional.clearance(self.env, position, self.params)  # noqa: E731
+        return static_threat(jax.vmap(lambda body: plan_clearance(body, model, clearance))(bodies))
 
     def _summed(self, states: Any, static: Array | None, alive: Array | None) -> Array:
-        """(B, A) sum over hazards (Theorem 3), to which `static` of the states' agents belongs.
+        """Returns the sum over hazards (B, A) of their threats (Theorem 3).
 
-        Under several plans, that of the best plan for each action: the least of upper functions
-        (docs/theory.md).
+        Under several plans it is that of the best plan for each action: the least of several upper
+        bounds is an upper bound (docs/theory.md).
+
+        Args:
+            states: states, leading axis (B,).
+            static: (B, K, A) joint threats of the fixed hazards, from `_static`; None without
+                plans.
+            alive: (B,) bool; where it is False, the sum is 0.
         """
         hazards = jax.vmap(self.env.hazards, (0, None))(states, self.params)
         if alive is not None:
@@ -123,19 +138,20 @@ class PMDP(struct.PyTreeNode):
                 for kind, group in hazards.items()
             }
         if static is None:
-            return total_threat(self.threats or {}, states.agent, hazards)
+            return total_threat(self.threats, states.body, hazards)
         if hazards:
-            moving = bounded(total_threat(self.threats or {}, states.agent, hazards))
+            moving = bounded(total_threat(self.threats, states.body, hazards))
             static = static + moving.reshape(static.shape)
         best = jnp.min(static, axis=1)
         return best if alive is None else jnp.where(alive[:, None], best, 0.0)
 
     def _backup(self, states: Any) -> Array:
-        """(B, A) E[d + min_a' U(s', a')], U the sum over hazards, over `lookahead` outcomes.
+        """Returns E[d + min_a' U(s', a')] of each action, (B, A), where U is the sum over hazards.
 
-        The outcomes are drawn jointly, by the environment's own step. Danger is not discounted.
+        The mean is over `lookahead` outcomes, drawn jointly by the environment's own step. Danger
+        is not discounted.
         """
-        actions = jnp.arange(self.env.num_actions(self.params))
+        actions = jnp.arange(self.num_actions)
 
         def outcomes(state: Any) -> Any:
             key = jax.random.fold_in(jax.random.key(OUTCOMES), state.time)
@@ -145,29 +161,12 @@ class PMDP(struct.PyTreeNode):
 
         reached, outcome = jax.vmap(outcomes)(states)  # (B, A, S)
         flat = lambda a: a.reshape(-1, *a.shape[3:])  # noqa: E731
-        # The agent's own step is no matter of chance (Assumption 1): one of it for each action.
-        agents = jax.tree.map(lambda a: a[:, :, 0].reshape(-1, *a.shape[3:]), reached.agent)
-        static = self._static(agents)
+        # The body's own step is deterministic, so that one per action is enough.
+        bodies = jax.tree.map(lambda a: a[:, :, 0].reshape(-1, *a.shape[3:]), reached.body)
+        static = self._static(bodies)
         if static is not None:
             static = jnp.repeat(static, self.lookahead, axis=0)
         going = flat(~outcome.terminated)
         after = jnp.min(self._summed(jax.tree.map(flat, reached), static, going), axis=-1)
         danger = flat(outcome.danger) + jnp.where(going, after, 0.0)
         return jnp.mean(danger.reshape(outcome.danger.shape), axis=-1)
-
-
-def encode(observation: Array, scan: int, pool: int) -> Encoded:
-    """Splits an observation into its LIDAR, min-pooled and in bytes, and the rest.
-
-    Bytes know no nan: where the LIDAR holds a number that is none, the rest is nan.
-
-    Args:
-        observation: (n,) whose first `scan` values are distances in [0, 1], 0 for none.
-        scan: number of LIDAR values.
-        pool: neighbouring bins of which only the nearest distance is kept.
-    """
-    distance = jnp.where(observation[:scan] == 0, 1.0, observation[:scan])
-    nearest = jnp.min(distance.reshape(scan // pool, pool), axis=-1)
-    sound = jnp.all(jnp.isfinite(observation[:scan]))
-    rest = jnp.where(sound, observation[scan:], jnp.nan)
-    return Encoded(jnp.round(nearest * 255).astype(jnp.uint8), rest)

@@ -1,1 +1,1 @@
-"""Figures from saved results; the only importer of matplotlib. Nothing here computes results."""
+"""Figures from saved results; only this package imports matplotlib, and it computes no results."""

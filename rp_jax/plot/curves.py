@@ -1,4 +1,4 @@
-"""Learning curves."""
+"""Figures of learning curves, scores, thresholds and crashes."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,12 +17,14 @@ BLUE, RED, GREY = "#2b6cb0", "#c53030", "#718096"
 
 
 def learning_curves(history: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
-    """Return, crash rate and states without an admissible action, against agent steps.
+    """Draws return, crash rate and insecure states against environment steps.
+
+    An insecure state is one without an admissible action.
 
     Args:
         history: one row per chunk and seed, as in metrics.jsonl.
-        title: of the figure.
-        path: of the PNG.
+        title: title of the figure.
+        path: where to write the PNG.
     """
     steps = sorted({row["steps"] for row in history})
     of = {s: [row for row in history if row["steps"] == s] for s in steps}
@@ -71,18 +73,19 @@ def methods(
     path: Path,
     levels: Mapping[str, Sequence[Mapping[str, Any]]] | None = None,
 ) -> None:
-    """Return and crash rate while learning: a column per task, a line per method.
+    """Draws return and crash rate while learning, with a column per task and a line per method.
 
-    Lines are means over seeds, bands 90 % intervals of Student; of one seed, the band of the crash
-    rate is the 90 % interval of Clopper and Pearson.
+    Lines are means over seeds, bands 90 % intervals of Student. For a single seed the band of the
+    crash rate is the 90 % interval of Clopper and Pearson.
 
     Args:
-        panels: by title, one row per chunk, method and seed, as in metrics.jsonl.
-        path: of the PNG.
-        levels: by title, rows of what does not learn: method, return_mean, crash_rate; dashed.
+        panels: by the task's title, one row per chunk, method and seed, as in metrics.jsonl.
+        path: where to write the PNG.
+        levels: by the task's title, rows with method, return_mean and crash_rate of methods that do
+            not learn; drawn dashed.
     """
     most = max(len({row["method"] for row in history}) for history in panels.values())
-    below = 0.12 + 0.06 * (most // 2 + 2)  # for the legend
+    below = 0.12 + 0.06 * (most // 2 + 2)  # height of the legend
     figure, axes = plt.subplots(
         3,
         len(panels),
@@ -123,7 +126,7 @@ OTHERS = (RED, "#dd6b20", "#d69e2e", "#2f855a", "#805ad5", "#d53f8c", GREY)
 
 
 def _percent(axis: Any, which: str) -> None:
-    """Crash rates from none to all on one scale; `which` is "x" or "y"."""
+    """Sets an axis ("x" or "y") to show crash rates from 0 to 100 % on one scale."""
     getattr(axis, f"set_{which}scale")("symlog", linthresh=0.01)
     getattr(axis, f"set_{which}lim")(-0.001, 130)
     ticks, names = [0, 0.01, 0.1, 1, 10, 100], ["0", ".01", ".1", "1", "10", "100"]
@@ -131,7 +134,7 @@ def _percent(axis: Any, which: str) -> None:
 
 
 def _line(axes: Any, rows: Sequence[Mapping[str, Any]], colour: str, name: str) -> None:
-    """A method's return and crash rate, with their bands."""
+    """Draws a method's return and crash rate, with their bands."""
     steps = sorted({row["steps"] for row in rows})
     groups = [[row for row in rows if row["steps"] == s] for s in steps]
     returns = [_band([row["return_mean"] for row in group]) for group in groups]
@@ -148,7 +151,7 @@ def _line(axes: Any, rows: Sequence[Mapping[str, Any]], colour: str, name: str) 
 
 
 def _band(values: Sequence[float]) -> tuple[float, float, float]:
-    """(mean, low, high) of the 90 % interval; of one value, itself."""
+    """Returns (mean, low, high) of the 90 % interval; all are equal for a single value."""
     mean, width = statistics.mean_interval(np.asarray(values), 0.9)
     width = 0.0 if np.isnan(width) else width
     return mean, mean - width, mean + width
@@ -159,12 +162,12 @@ def scores(
     published: Mapping[str, Mapping[str, tuple[float, float]]],
     path: Path,
 ) -> None:
-    """Return and crash rate by method with 95 % intervals, a line of panels per variant.
+    """Draws return and crash rate of each method with 95 % intervals, with panels per variant.
 
     Args:
-        rows: with variant, method, return_mean, return_ci95, crash_rate, crash_ci95.
-        published: by variant and method, (return, crash rate): diamonds.
-        path: of the PNG.
+        rows: rows with variant, method, return_mean, return_ci95, crash_rate and crash_ci95.
+        published: by variant and method, the published (return, crash rate); drawn as diamonds.
+        path: where to write the PNG.
     """
     variants = list(dict.fromkeys(row["variant"] for row in rows))
     methods = list(dict.fromkeys(row["method"] for row in rows))
@@ -208,11 +211,11 @@ def scores(
 
 
 def frontier(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Return and crash rate over the threshold, with 95 % intervals, a column per variant.
+    """Draws return and crash rate against the threshold, with 95 % intervals, by variant.
 
     Args:
-        rows: with variant, planner, x, return_mean, return_ci95, crash_rate, crash_ci95.
-        path: of the PNG.
+        rows: rows with variant, planner, x, return_mean, return_ci95, crash_rate and crash_ci95.
+        path: where to write the PNG.
     """
     variants = list(dict.fromkeys(row["variant"] for row in rows))
     planners = list(dict.fromkeys(row["planner"] for row in rows))
@@ -247,11 +250,13 @@ def frontier(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def before_crashes(crashes: Sequence[Sequence[Mapping[str, Any]]], path: Path) -> None:
-    """What was known and what could be done in the last steps before each crash.
+    """Draws the threat and the risks in the last steps before each crash.
 
     Args:
-        crashes: for each crash, rows of `before` (steps), `threat`, `risk` and `best_risk`.
-        path: of the PNG.
+        crashes: for each crash, rows with `before` (steps before the crash), `threat` (least threat
+            of any action), `risk` (probability of a crash after the agent's action) and `best_risk`
+            (that after the best action).
+        path: where to write the PNG.
     """
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained", sharey=True)
     shown = (
@@ -259,7 +264,7 @@ def before_crashes(crashes: Sequence[Sequence[Mapping[str, Any]]], path: Path) -
         ("risk", RED, "risk of its action"),
         ("best_risk", BLUE, "risk of the best action"),
     )
-    floor = 1e-3  # below it, a risk is hardly measured
+    floor = 1e-3  # smaller risks are hardly measured
     steps = sorted({row["before"] for rows in crashes for row in rows})
     for axis, (name, colour, title) in zip(axes, shown, strict=True):
         for rows in crashes:
@@ -282,7 +287,12 @@ def before_crashes(crashes: Sequence[Sequence[Mapping[str, Any]]], path: Path) -
 
 
 def fit_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path) -> None:
-    """Training and validation loss of the threat models, by kind of hazard."""
+    """Draws training and validation loss of the threat models, by kind of hazard.
+
+    Args:
+        curves: by kind of hazard, rows with step, loss and validation_loss.
+        path: where to write the PNG.
+    """
     figure, axes = plt.subplots(
         1, len(curves), figsize=(4.5 * len(curves), 3.4), layout="constrained", squeeze=False
     )
@@ -309,15 +319,15 @@ def comparison(
     vertical: Sequence[str],
     path: Path,
 ) -> None:
-    """Lines of means over repeats, with each repeat as a dot; both axes logarithmic.
+    """Draws lines of means over repeats, with each repeat as a dot, on logarithmic axes.
 
     Args:
-        rows: one per measurement.
+        rows: one row per measurement.
         panels: two fields whose values name a panel's column.
         line: field whose values name the lines.
         horizontal: field of the horizontal axis.
-        vertical: fields of the vertical axes, one row of panels each.
-        path: of the PNG.
+        vertical: fields of the vertical axes, with one row of panels each.
+        path: where to write the PNG.
     """
     columns = list(dict.fromkeys(tuple(row[name] for name in panels) for row in rows))
     figure, axes = plt.subplots(

@@ -1,4 +1,4 @@
-"""How time grows with a size."""
+"""Figures of how time grows with a size."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,13 +15,13 @@ BLUE, RED = "#2b6cb0", "#c53030"
 
 
 def growth(series: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Seconds over a size, a panel each, both axes logarithmic, with the fitted line.
+    """Draws seconds against a size on logarithmic axes, with a fitted line; a panel per series.
 
     Args:
         series: at least one, with title, size (its name), vertical (what takes the time), sizes,
-            seconds (median), fastest and slowest (seconds, one per size), slope, and fitted (how
-            many of the largest sizes the line is fitted to).
-        path: of the PNG.
+            seconds (medians), fastest and slowest (seconds), each with one number per size, slope,
+            and fitted (to how many of the largest sizes the line is fitted).
+        path: where to write the PNG.
     """
     columns = min(2, len(series))
     rows = -(-len(series) // columns)
@@ -37,6 +37,7 @@ def growth(series: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def _panel(axis: plt.Axes, one: Mapping[str, Any]) -> None:
+    """Draws one series."""
     sizes, seconds = (np.asarray(one[name], float) for name in ("sizes", "seconds"))
     ends = [np.asarray(one[name], float) for name in ("fastest", "slowest")]
     spread = np.stack([np.maximum(seconds - ends[0], 0), np.maximum(ends[1] - seconds, 0)])

@@ -1,4 +1,4 @@
-"""Threat heat maps (figure 4b to 4d)."""
+"""Heat maps of threats (figure 4b to 4d)."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,24 +12,24 @@ from matplotlib.colors import LogNorm
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-FLOOR = 1e-4  # smaller threats look alike
+FLOOR = 1e-4  # smaller threats have the same colour
 
 
 class Panel(NamedTuple):
-    """One heat map."""
+    """The data of one heat map."""
 
     title: str
-    threat: np.ndarray  # (ny, nx)
+    threat: np.ndarray  # (ny, nx) from the bottom left
     extent: tuple[float, float, float, float]  # left, right, bottom, top, room units
 
 
 def heat_maps(panels: Sequence[Panel], x: float, path: Path, decorate=None) -> None:
-    """Threats in colour on a logarithmic scale; a line where they equal x.
+    """Draws threats in colour on a logarithmic scale, with a line where they equal x.
 
     Args:
-        panels: side by side.
+        panels: drawn side by side.
         x: the threshold.
-        path: of the PNG.
+        path: where to write the PNG.
         decorate: called with (axis, index) to add to a panel.
     """
     columns = min(3, len(panels))

@@ -1,4 +1,4 @@
-"""Where vehicles went, and an animation of an episode with the threat of every action."""
+"""Trajectories of vehicles, and animations of episodes with the threat of every action."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,40 +18,45 @@ GOOD, BAD = "#38a169", "#c53030"
 
 
 class Scene(NamedTuple):
-    """What stands still: drawn under everything else."""
+    """Everything that stands still, drawn below the rest."""
 
-    walls: np.ndarray  # (w, 2)
-    corners: Sequence[tuple[float, float]] = ()  # of the room, with safety zones
-    zone: float = 0.0  # side of the zones' squares, or their radius
-    round_zones: bool = False
-    radius: float = 0.1  # of the vehicles
-    colours: Sequence[str] = ()  # of the obstacles, where they differ
-    rings: Sequence[tuple[np.ndarray, float, str]] = ()  # places (n, 2), radius and colour
+    walls: np.ndarray  # (w, 2) wall points, room units
+    corners: Sequence[tuple[float, float]] = ()  # corners of the room with safety zones
+    zone: float = 0.0  # side of the zones' squares, or their radius, room units
+    round_zones: bool = False  # zones are quarter circles
+    radius: float = 0.1  # radius of the vehicles, room units
+    colours: Sequence[str] = ()  # colour of each obstacle, where they differ
+    rings: Sequence[tuple[np.ndarray, float, str]] = ()  # (centres (n, 2), radius, colour)
 
 
 class Episode(NamedTuple):
     """An episode step by step, up to its end."""
 
-    position: np.ndarray  # (t, 2)
-    heading: np.ndarray  # (t, 2)
-    obstacles: np.ndarray  # (t, n, 2); n may be 0
-    obstacle_headings: np.ndarray  # (t, n, 2)
-    action: np.ndarray  # (t,)
-    threat: np.ndarray  # (t, A)
-    admissible: np.ndarray  # (t, A)
-    secure: np.ndarray  # (t,)
-    hit: np.ndarray  # (t,) bool, danger was met on the way here
+    position: np.ndarray  # (t, 2) room units
+    heading: np.ndarray  # (t, 2) unit vectors
+    obstacles: np.ndarray  # (t, n, 2) positions of the obstacles; n may be 0
+    obstacle_headings: np.ndarray  # (t, n, 2) unit vectors
+    action: np.ndarray  # (t,) int
+    threat: np.ndarray  # (t, A) threats of the actions
+    admissible: np.ndarray  # (t, A) bool
+    secure: np.ndarray  # (t,) bool, some action's threat is at most the threshold
+    hit: np.ndarray  # (t,) bool, the step that led here met danger
 
 
 class Path2D(NamedTuple):
-    """What `trajectories` draws of an episode."""
+    """The part of an episode that `trajectories` draws."""
 
-    position: np.ndarray  # (t, 2)
-    hit: np.ndarray  # (t,) bool
+    position: np.ndarray  # (t, 2) room units
+    hit: np.ndarray  # (t,) bool, the step that led here met danger
 
 
 def draw_scene(axis: Any, scene: Scene) -> None:
-    """Walls as dots, safety zones shaded, rings about their places."""
+    """Draws walls as dots, safety zones shaded, and rings.
+
+    Args:
+        axis: the matplotlib axes to draw on.
+        scene: everything that stands still.
+    """
     low, high = scene.walls.min(axis=0), scene.walls.max(axis=0)
     for corner in scene.corners:
         if scene.round_zones:
@@ -74,7 +79,14 @@ def draw_scene(axis: Any, scene: Scene) -> None:
 def trajectories(
     panels: Sequence[tuple[str, Scene, Sequence[Episode | Path2D]]], path: Path
 ) -> None:
-    """Paths of several episodes per panel (figure 6); S marks the start, red crosses crashes."""
+    """Draws the paths of several episodes per panel (figure 6).
+
+    An S marks each start, a red cross each crash.
+
+    Args:
+        panels: (title, scene, episodes) of each panel.
+        path: where to write the PNG.
+    """
     columns = min(3, len(panels))
     lines = -(-len(panels) // columns)
     extents = [np.ptp(scene.walls, axis=0) for _, scene, _ in panels]
@@ -94,7 +106,7 @@ def trajectories(
         draw_scene(axis, scene)
         crashes = 0
         for episode in episodes:
-            dots = "." if len(episode.position) <= 20 else None  # where steps are long
+            dots = "." if len(episode.position) <= 20 else None  # short episodes have long steps
             axis.plot(*episode.position.T, marker=dots, color="#2b6cb0", alpha=0.6, linewidth=1)
             axis.annotate("S", episode.position[0], fontsize=8, ha="center", va="center")
             crashes += bool(episode.hit.any())
@@ -114,19 +126,19 @@ def animate(
     on_progress: Callable[[int, int], None] | None = None,
     rows: str = "acceleration",
 ) -> None:
-    """An animated GIF: the world on the left, the threat of each action on the right.
+    """Writes an animated GIF: the world on the left, the threat of each action on the right.
 
-    Inadmissible actions are crossed out, the chosen one is framed.
+    Inadmissible actions are crossed out, and the chosen one is framed.
 
     Args:
-        scene: what stands still.
-        episode: what moves.
-        accelerations: of the action table, one row each.
-        turns: of the action table, one column each, right to left in the table.
+        scene: everything that stands still.
+        episode: everything that moves.
+        accelerations: accelerations of the action table, one row each.
+        turns: turns of the action table, one column each, from right to left.
         x: the threshold.
-        path: of the GIF.
+        path: where to write the GIF.
         on_progress: called with (frames done, frames).
-        rows: what the rows of the table are.
+        rows: name of the quantity in the rows.
     """
     frames = len(episode.action)
     shape = (len(accelerations), len(turns))
@@ -139,11 +151,11 @@ def animate(
         world.add_patch(Circle((0, 0), scene.radius, color=colour))
         for colour in scene.colours or [OBSTACLE] * episode.obstacles.shape[1]
     ]
-    agent = world.add_patch(Circle((0, 0), scene.radius, color=AGENT, zorder=4))
+    body = world.add_patch(Circle((0, 0), scene.radius, color=AGENT, zorder=4))
     noses = [
         world.plot([], [], color="black", linewidth=1, zorder=5)[0] for _ in range(1 + len(others))
     ]
-    # The leftmost turn stands leftmost, as seen by the driver.
+    # The strongest turn to the left is in the leftmost column, as the driver sees it.
     image = table.imshow(np.ones(shape), norm=LogNorm(1e-4, 1, clip=True), cmap="inferno")
     table.set_xticks(range(shape[1]), [f"{t:+.2f}" for t in turns[::-1]])
     table.tick_params(axis="x", labelrotation=0 if shape[1] <= 5 else 60)
@@ -159,7 +171,7 @@ def animate(
 
     def show(t: int) -> None:
         trail.set_data(*episode.position[: t + 1].T)
-        agent.center = episode.position[t]
+        body.center = episode.position[t]
         bodies = [(episode.position[t], episode.heading[t])]
         for k, patch in enumerate(others):
             patch.center = episode.obstacles[t, k]

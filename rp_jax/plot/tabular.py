@@ -12,7 +12,7 @@ from matplotlib.colors import LogNorm
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-FLOOR = 1e-6  # smaller threats look alike
+FLOOR = 1e-6  # smaller threats have the same colour
 COLOURS = ("#c05621", "#805ad5", "#2c7a7b", "#2b6cb0", "#1a202c")
 MARKERS = ("o", "^", "v", "s", "D")
 
@@ -20,14 +20,14 @@ MARKERS = ("o", "^", "v", "s", "D")
 def lake(
     rows: Sequence[str], threat: np.ndarray, actions: Sequence[str], title: str, path: Path
 ) -> None:
-    """The threat of each action on the map, holes grey.
+    """Draws the threat of each action on the map, with holes in grey.
 
     Args:
-        rows: of the map.
-        threat: (A, rows, columns).
-        actions: names.
-        title: of the figure.
-        path: of the PNG.
+        rows: rows of the map, as for `frozen_lake`.
+        threat: (A, rows, columns) threats.
+        actions: names of the actions.
+        title: title of the figure.
+        path: where to write the PNG.
     """
     letters = np.asarray([[*row] for row in rows])
     figure, axes = plt.subplots(
@@ -63,14 +63,15 @@ def budgets(
     path: Path,
     rule: str = "paper",
 ) -> None:
-    """Return and danger against the bound c, one column per lake (figures 3a and 3b).
+    """Draws return and danger against the bound c, with one column per lake (figures 3a and 3b).
 
     Args:
-        rows: with variant, baseline, rule, c, return_mean and danger (None: no safe baseline).
-        optima: with variant, c, optimum, lagrangian and lagrangian_danger.
-        baselines: one line each.
-        path: of the PNG.
-        rule: whose rows are drawn.
+        rows: rows with variant, baseline, rule, c, return_mean and danger (None where no baseline
+            policy is safe).
+        optima: rows with variant, c, optimum, lagrangian and lagrangian_danger.
+        baselines: names of the baseline policies, one line each.
+        path: where to write the PNG.
+        rule: the threshold rule whose rows are drawn.
     """
     variants = list(dict.fromkeys(row["variant"] for row in rows))
     figure, axes = plt.subplots(
@@ -108,13 +109,13 @@ def budgets(
 def shares(
     rows: Sequence[Mapping[str, Any]], rules: Sequence[str], path: Path, baseline: str = "eta*"
 ) -> None:
-    """What each threshold rule earns of the exact optimum, against c.
+    """Draws the return of each threshold rule as a share of the exact optimum, against c.
 
     Args:
-        rows: with variant, baseline, rule, c and share.
-        rules: one line each.
-        path: of the PNG.
-        baseline: whose rows are drawn.
+        rows: rows with variant, baseline, rule, c and share.
+        rules: names of the threshold rules, one line each.
+        path: where to write the PNG.
+        baseline: the baseline policy whose rows are drawn.
     """
     variants = list(dict.fromkeys(row["variant"] for row in rows))
     figure, axes = plt.subplots(
@@ -137,16 +138,17 @@ def shares(
 def _of(
     rows: Sequence[Mapping[str, Any]], variant: str, baseline: str, rule: str
 ) -> list[Mapping[str, Any]]:
-    """The rows of one line."""
+    """Returns the rows of one line."""
     wanted = (variant, baseline, rule)
     return [row for row in rows if (row["variant"], row["baseline"], row["rule"]) == wanted]
 
 
 def _style(i: int, label: str) -> dict[str, Any]:
-    """How the i-th line is drawn."""
+    """Returns how the i-th line is drawn."""
     look = {"color": COLOURS[i], "marker": MARKERS[i], "markersize": 5, "alpha": 0.8}
     return {**look, "label": label}
 
 
 def _number(value: float | None) -> float:
+    """Returns a number, nan for None."""
     return float("nan") if value is None else value

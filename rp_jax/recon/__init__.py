@@ -1,1 +1,1 @@
-"""Reconnaissance: where to start sub-R-MDPs from, and what their threats are."""
+"""Reconnaissance: estimates of threats, and the states to estimate them in."""

@@ -1,1 +1,1 @@
-"""Finite CMDPs, solved exactly: the oracle that the approximate part is judged by."""
+"""Finite CMDPs, solved exactly: the theory, and an oracle for the rest of the library."""

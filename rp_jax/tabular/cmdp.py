@@ -1,7 +1,7 @@
 """Finite constrained MDPs (equations 1 and 2) as arrays.
 
-S states, A actions. H is the length of the time axis: the horizon T, or 1 for the infinite
-horizon, where everything is stationary.
+They have S states and A actions. H is the length of the time axis: the horizon T, or 1 for the
+infinite horizon, where everything is stationary.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,23 +14,23 @@ from jax import Array
 
 from rp_jax.validate import number
 
-ROUNDING = 1e-6  # by which given probabilities may miss the sum 1; they are then divided by it
+ROUNDING = 1e-6  # greatest error of a sum of probabilities; they are divided by their sum
 
 
 class FiniteCMDP(struct.PyTreeNode):
-    """(S, A, r, d, P, P_0) with discounts and horizon. Made by `make`, which checks it."""
+    """A finite CMDP (S, A, r, d, P, P_0) with discounts and horizon; to be built by `make`."""
 
-    transition: Array  # (S, A, S) P(s' | s, a)
-    reward: Array  # (S, A) r
-    danger: Array  # (S, A) d >= 0
-    start: Array  # (S,) P_0
+    transition: Array  # (S, A, S) probabilities P(s' | s, a)
+    reward: Array  # (S, A) expected reward r(s, a)
+    danger: Array  # (S, A) expected danger d(s, a) >= 0
+    start: Array  # (S,) distribution P_0 of the first state
     gamma: Array  # () discount of reward, in [0, 1]
     beta: Array  # () discount of danger, in [0, 1]
-    horizon: int | None = struct.field(pytree_node=False)  # T; None: infinite
+    horizon: int | None = struct.field(pytree_node=False)  # number of steps T; None: infinite
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(H, S, A)."""
+        """The shape (H, S, A) of time-indexed threats and policies."""
         states, actions = self.reward.shape
         return self.horizon or 1, states, actions
 
@@ -45,15 +45,15 @@ def make(
     beta: float,
     horizon: int | None,
 ) -> FiniteCMDP:
-    """A checked CMDP.
+    """Returns a finite CMDP, checked.
 
     Args:
-        transition: (S, A, S), rows sum to 1.
-        reward: (S, A), or (S, A, S) where it depends on the state arrived in.
-        danger: as reward, at least 0.
+        transition: (S, A, S) probabilities; rows sum to 1.
+        reward: (S, A), or (S, A, S) where it depends on the next state.
+        danger: (S, A) or (S, A, S), at least 0.
         start: (S,) distribution of the first state, or the index of the only one.
-        gamma: discount of reward, in [0, 1], below 1 for the infinite horizon.
-        beta: discount of danger, likewise.
+        gamma: discount of reward, in [0, 1]; below 1 for the infinite horizon.
+        beta: discount of danger, in [0, 1]; below 1 for the infinite horizon.
         horizon: number of steps, or None for the infinite horizon.
 
     Raises:
@@ -108,18 +108,20 @@ def from_table(
     beta: float,
     horizon: int | None,
 ) -> FiniteCMDP:
-    """A CMDP from a transition table as gymnasium's toy-text environments hold it.
+    """Returns a CMDP from a transition table like those of gymnasium's toy-text environments.
 
-    Successors that are listed twice are added up. A step that ends the episode earns what it
-    earns and leads to one more state, the last, where nothing is earned and nothing endangers.
+    The probabilities of a successor that is listed several times are added up. A step that ends the
+    episode gives its reward and leads to an additional state, the last one, which has no reward and
+    no danger.
 
     Args:
         table: table[s][a] lists (probability, next state, reward, ends the episode).
         danger: (S,) danger of arriving in each state.
-        start: as for `make`, without the state at the end.
-        gamma: as for `make`.
-        beta: as for `make`.
-        horizon: as for `make`.
+        start: (S,) distribution of the first state, or the index of the only one, without the
+            additional state.
+        gamma: discount of reward, in [0, 1]; below 1 for the infinite horizon.
+        beta: discount of danger, in [0, 1]; below 1 for the infinite horizon.
+        horizon: number of steps, or None for the infinite horizon.
 
     Raises:
         ValueError: the table has gaps, or an argument is out of range.
@@ -162,7 +164,7 @@ def from_table(
 
 
 def _first(start: Any, states: int) -> np.ndarray:
-    """(S,) the distribution of the first state, given as that or as an index."""
+    """Returns the distribution of the first state (S,), given as such or as an index."""
     if isinstance(start, int | np.integer) and not isinstance(start, bool):
         number("start", int(start), least=0, most=states - 1, integer=True)
         return np.eye(states)[start]
@@ -173,7 +175,15 @@ def _first(start: Any, states: int) -> np.ndarray:
 
 
 def array_of(name: str, value: Any) -> np.ndarray:
-    """As float64, finite even in the precision that JAX will hold it in."""
+    """Returns an array in float64 whose values are finite also in the precision that JAX uses.
+
+    Args:
+        name: name of the array, for the message.
+        value: numbers, nested in sequences or arrays.
+
+    Raises:
+        ValueError: the value is not an array of real numbers, or has one that is not finite.
+    """
     try:
         array = np.asarray(value)
         if np.iscomplexobj(array):
@@ -187,7 +197,15 @@ def array_of(name: str, value: Any) -> np.ndarray:
 
 
 def distribution(name: str, array: np.ndarray) -> np.ndarray:
-    """Checked along the last axis, and divided by its sum."""
+    """Returns probabilities divided by their sums, checked.
+
+    Args:
+        name: name of the array, for the message.
+        array: (..., n) probabilities, whose sum over the last axis must be 1 up to rounding.
+
+    Raises:
+        ValueError: a probability is negative, or a sum is not 1.
+    """
     if array.min() < 0:
         raise ValueError(f"{name} has the probability {array.min()}; it must be at least 0")
     total = array.sum(axis=-1, keepdims=True)

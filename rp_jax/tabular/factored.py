@@ -1,7 +1,7 @@
-"""Factored CMDPs of Assumption 1, where Theorem 3 can be checked against the joint model.
+"""Factored CMDPs (Assumption 1), in which Theorem 3 can be checked against the joint model.
 
-An agent moves by itself; each of N hazards moves by itself and may react to the agent. Danger 1
-is done at a step at which any hazard hits.
+A body moves by itself. Each of N hazards moves by itself too, and may react to the body. A step has
+danger 1 if any hazard is hit.
 """
 
 from collections.abc import Sequence
@@ -17,29 +17,33 @@ from rp_jax.tabular.thresholds import certified
 
 
 class Hazard(struct.PyTreeNode):
-    """One source of danger: p(s_n' | s_n, s_o, a) and d_n(s_o, s_n, a)."""
+    """A hazard's dynamics p(s_n' | s_n, s_o, a), and its danger d_n(s_o, s_n, a)."""
 
-    transition: Array  # (So, A, Sn, Sn)
-    hits: Array  # (So, Sn, A) in [0, 1], an indicator
-    start: Array  # (Sn,)
+    transition: Array  # (So, A, Sn, Sn) probabilities of the hazard's next state
+    hits: Array  # (So, Sn, A) 1 where the hazard is hit, 0 elsewhere
+    start: Array  # (Sn,) distribution of its first state
 
 
 class Factored(struct.PyTreeNode):
-    """An agent and its hazards."""
+    """A body and its hazards."""
 
-    agent: Array  # (So, A, So) p(s_o' | s_o, a)
-    reward: Array  # (So, A)
-    start: Array  # (So,)
+    body: Array  # (So, A, So) probabilities p(s_o' | s_o, a) of the body's next state
+    reward: Array  # (So, A) reward
+    start: Array  # (So,) distribution of the body's first state
     hazards: Sequence[Hazard]
-    beta: Array  # ()
-    horizon: int | None = struct.field(pytree_node=False)
+    beta: Array  # () discount of danger and of reward
+    horizon: int | None = struct.field(pytree_node=False)  # number of steps; None: infinite
 
 
 def joint(model: Factored) -> FiniteCMDP:
-    """The whole CMDP over (s_o, s_1, ..., s_N), the agent's state counting slowest."""
-    agents, actions, _ = model.agent.shape
-    kernel = model.agent[:, None, :, :, None]  # (So, rest, A, So', rest')
-    free = jnp.ones((agents, 1, actions))  # (So, rest, A) no hazard hits
+    """Returns the whole CMDP over (s_o, s_1, ..., s_N), the last hazard's state varying fastest.
+
+    Args:
+        model: the body and its hazards.
+    """
+    bodies, actions, _ = model.body.shape
+    kernel = model.body[:, None, :, :, None]  # (So, rest, A, So', rest')
+    free = jnp.ones((bodies, 1, actions))  # (So, rest, A) no hazard hits
     start = model.start
     for hazard in model.hazards:
         moves = jnp.moveaxis(hazard.transition, 1, 2)  # (So, Sn, A, Sn')
@@ -62,12 +66,25 @@ def joint(model: Factored) -> FiniteCMDP:
 
 
 def sub_rmdp(model: Factored, n: int) -> FiniteCMDP:
-    """The sub-R-MDP of the agent and hazard n alone, over (s_o, s_n)."""
+    """Returns the sub-R-MDP of the body and hazard n alone, over (s_o, s_n).
+
+    Args:
+        model: the body and its hazards.
+        n: index of the hazard.
+    """
     return joint(model.replace(hazards=[model.hazards[n]]))
 
 
 def lifted(model: Factored, policy: Array) -> Array:
-    """A policy of the agent's state, (So, A) or (H, So, A), on the states of `joint`."""
+    """Returns a policy over the body's states as one over the states of `joint`.
+
+    Args:
+        model: the body and its hazards.
+        policy: (So, A) or (H, So, A) probabilities.
+
+    Returns:
+        (S, A) or (H, S, A) probabilities.
+    """
     rest = 1
     for hazard in model.hazards:
         rest *= len(hazard.start)
@@ -75,23 +92,34 @@ def lifted(model: Factored, policy: Array) -> Array:
 
 
 def sub_threats(model: Factored, policy: Array) -> list[Array]:
-    """T^{eta,n} of each hazard, (H, So, Sn, A) (Algorithm 2, line 2).
+    """Returns the threats T^{eta,n} of each hazard (Algorithm 2, line 2).
 
     Args:
-        model: of agent and hazards.
-        policy: eta^(o), (So, A) or (H, So, A): it sees the agent's state only (line 1).
+        model: the body and its hazards.
+        policy: (So, A) or (H, So, A), the baseline policy eta^(o), which sees only the body's
+            state.
+
+    Returns:
+        A list with (H, So, Sn, A) threats for each hazard.
     """
     found = []
     for n in range(len(model.hazards)):
         alone = model.replace(hazards=[model.hazards[n]])
         action = threat(sub_rmdp(model, n), lifted(alone, policy)).action
-        agents = model.agent.shape[0]
-        found.append(action.reshape(len(action), agents, -1, action.shape[-1]))
+        bodies = model.body.shape[0]
+        found.append(action.reshape(len(action), bodies, -1, action.shape[-1]))
     return found
 
 
 def summed(threats: Sequence[Array]) -> Array:
-    """(H, S, A) sum of sub-threats at each joint state, the upper bound of Theorem 3."""
+    """Returns the sum of sub-threats at each joint state, the upper bound of Theorem 3.
+
+    Args:
+        threats: (H, So, Sn, A) for each hazard, from `sub_threats`.
+
+    Returns:
+        (H, S, A) over the states of `joint`.
+    """
     total = threats[0][:, :, :1] * 0
     for one in threats:
         total = total[:, :, :, None] + one[:, :, None]
@@ -100,15 +128,16 @@ def summed(threats: Sequence[Array]) -> Array:
 
 
 def approximate(model: Factored, policy: Array, c: Array | float) -> tuple[Array, Values]:
-    """Algorithm 2 exactly: the best policy inside the secure sets of the sum of sub-threats.
+    """Computes Algorithm 2 exactly: the best policy inside the secure sets of the summed threats.
 
     Args:
-        model: of agent and hazards.
-        policy: eta^(o), (So, A) or (H, So, A).
-        c: bound on the danger of an episode.
+        model: the body and its hazards.
+        policy: (So, A) or (H, So, A), the baseline policy eta^(o).
+        c: bound of the danger of an episode.
 
     Returns:
-        x, by the certificate (negative: there is none for this c), and the plan.
+        The threshold x that the certificate allows (negative if there is none for this c), and the
+        values of the best policy.
     """
     cmdp = joint(model)
     total = summed(sub_threats(model, policy))
@@ -117,8 +146,16 @@ def approximate(model: Factored, policy: Array, c: Array | float) -> tuple[Array
 
 
 def truncation(beta: Array | float, steps: int, worst: Array | float) -> Array:
-    """() what a threat from rollouts of `steps` steps may lack: beta^steps times D's maximum.
+    """Returns how much of a threat rollouts of limited length may miss: beta^steps * worst.
 
     Theorem 3 holds for truncated sub-rollouts once this is added to the sum.
+
+    Args:
+        beta: discount of danger.
+        steps: number of steps of the rollouts.
+        worst: greatest danger that can follow them.
+
+    Returns:
+        ().
     """
     return jnp.asarray(beta, float) ** steps * worst

@@ -18,8 +18,8 @@ MAP_8X8 = (
     "FFFHFFFG",
 )
 ACTIONS = ("left", "down", "right", "up")
-MOVES = ((0, -1), (1, 0), (0, 1), (-1, 0))  # rows downwards, columns to the right
-HOLES = ("released", "paper")
+MOVES = ((0, -1), (1, 0), (0, 1), (-1, 0))  # (rows down, columns to the right) of each action
+HOLES = ("released", "paper")  # as in the code behind the published numbers, or as in the text
 
 
 def frozen_lake(
@@ -31,22 +31,23 @@ def frozen_lake(
     beta: float = 1.0,
     slip: float = 2 / 3,
 ) -> FiniteCMDP:
-    """The lake as a CMDP: reward 1 for arriving at the goal, which ends the episode.
+    """Returns the lake as a CMDP, with reward 1 for arriving at the goal, which ends the episode.
 
-    States count along the rows; one more, the last, is the end of an episode.
+    States are numbered along the rows; one more, the last, stands for the end of an episode.
 
     Args:
-        rows: of S (start, one or more), F (frozen), H (hole), G (goal), # (wall).
-        holes: "released": they cannot be left, and each step that begins or ends in one costs 1,
-            so that a fall costs what is left of the episode; "paper": falling costs 1 and ends
-            the episode.
-        horizon: steps, or None.
+        rows: strings of the letters S (start, one or more), F (frozen), H (hole), G (goal) and
+            # (wall).
+        holes: "released": a hole cannot be left, and each step that begins or ends in one has
+            danger 1, so that a fall costs what is left of the episode; "paper": falling has danger
+            1 and ends the episode.
+        horizon: number of steps, or None for the infinite horizon.
         gamma: discount of reward.
         beta: discount of danger.
-        slip: probability, shared by both sides, of moving sideways instead.
+        slip: probability of moving sideways instead, half of it to either side.
 
     Raises:
-        ValueError: a row's length or letter is wrong, or a number is out of range.
+        ValueError: a row's length or a letter is wrong, or a number is out of range.
     """
     table, cells = transition_table(rows, holes=holes, slip=slip)
     starts = cells == "S"
@@ -65,7 +66,20 @@ def frozen_lake(
 def transition_table(
     rows: Sequence[str], *, holes: str = "released", slip: float = 2 / 3
 ) -> tuple[dict[int, dict[int, list[tuple[float, int, float, bool]]]], np.ndarray]:
-    """The lake's moves as gymnasium lists them, and its cells (S,) as letters."""
+    """Returns the lake's transitions in gymnasium's form, and the letters of its cells.
+
+    Args:
+        rows: strings of letters, as for `frozen_lake`.
+        holes: "released" or "paper", as for `frozen_lake`.
+        slip: probability of moving sideways instead, half of it to either side.
+
+    Returns:
+        table[s][a], which lists (probability, next state, reward, ends the episode), and the
+        letters (S,).
+
+    Raises:
+        ValueError: a row's length or a letter is wrong, or a number is out of range.
+    """
     one_of("holes", holes, HOLES)
     number("slip", slip, least=0, most=1)
     if isinstance(rows, str) or not all(isinstance(row, str) for row in rows):
@@ -94,7 +108,7 @@ def transition_table(
 
 
 def _moved(cells: np.ndarray, state: int, move: int) -> int:
-    """The cell that a move leads to; the edge and walls stop it."""
+    """Returns the cell that a move leads to; the edge and walls stop it."""
     height, width = cells.shape
     row, column = divmod(state, width)
     down, right = MOVES[move]

@@ -1,6 +1,6 @@
 """The best that a CMDP allows: a linear program over occupancies, and the Lagrangian curve.
 
-Host code in float64: scipy's HiGHS, and jitted backward induction.
+This is host code in float64, with SciPy's HiGHS and jitted backward induction.
 """
 
 import functools
@@ -17,26 +17,32 @@ from rp_jax.tabular.secure import most
 from rp_jax.tabular.threat import Values, expected, returns, solve, threat
 from rp_jax.validate import number
 
-TOLERANCE = 1e-9  # of HiGHS, primal and dual
-ROUNDING = 1e-9  # what a vertex must lie above a chord, relative to the values' scale
-MOST = 10_000  # vertices
+TOLERANCE = 1e-9  # primal and dual tolerance of HiGHS
+ROUNDING = 1e-9  # height that a new vertex must have above a chord, relative to the values' scale
+MOST = 10_000  # greatest number of vertices
 
 
 class Optimum(NamedTuple):
-    """The solution of equation 2."""
+    """The solution of a CMDP (equation 2)."""
 
-    value: float  # E[sum gamma^t r]
-    danger: float  # E[sum beta^t d]
-    policy: np.ndarray  # (H, S, A), uniform where it never comes
-    occupancy: np.ndarray  # (H, S, A) P(s_t, a_t); for the infinite horizon sum_t gamma^t of it
+    value: float  # expected return E[sum gamma^t r]
+    danger: float  # expected danger E[sum beta^t d]
+    policy: np.ndarray  # (H, S, A) probabilities; uniform in states that are never visited
+    occupancy: np.ndarray  # (H, S, A) P(s_t, a_t); for the infinite horizon its sum with gamma^t
 
 
 def optimum(cmdp: FiniteCMDP, c: float) -> Optimum:
-    """Equation 2 by a linear program over unnormalised occupancies, time-indexed if finite.
+    """Solves equation 2 by a linear program over occupancies.
+
+    The occupancies are not normalised, and time-indexed if the horizon is finite.
+
+    Args:
+        cmdp: the CMDP.
+        c: bound of the danger of an episode; infinity for none.
 
     Raises:
         ValueError: no policy keeps the danger at most c; or the horizon is infinite and the
-            discounts differ, where stationary policies are not enough.
+            discounts differ, for which stationary policies are not enough.
         RuntimeError: the linear program could not be solved.
     """
     c = float(c) if np.ndim(c) == 0 and np.isrealobj(c) else c
@@ -71,8 +77,8 @@ def optimum(cmdp: FiniteCMDP, c: float) -> Optimum:
             "dual_feasibility_tolerance": TOLERANCE,
         },
     )
-    # The interior point method, with crossover, is the fastest on long horizons, and solves some
-    # that the simplex method gives up after presolving.
+    # The interior point method with crossover is the fastest on long horizons, and solves some
+    # problems that the simplex method gives up on.
     found = program(method="highs-ipm")
     if found.status not in (0, 2):
         found = program(method="highs-ds")
@@ -90,13 +96,14 @@ def optimum(cmdp: FiniteCMDP, c: float) -> Optimum:
 
 
 def _policy_of(occupancy: np.ndarray) -> np.ndarray:
-    """(H, S, A) probabilities of actions, uniform where the state is never met."""
+    """Returns the policy (H, S, A) of an occupancy, uniform in states that are never visited."""
     total = occupancy.sum(axis=-1, keepdims=True)
     met = total > TOLERANCE
     return np.where(met, occupancy / np.where(met, total, 1.0), 1 / occupancy.shape[-1])
 
 
 def _same_discounts(cmdp: FiniteCMDP) -> None:
+    """Raises ValueError if the horizon is infinite and the discounts differ."""
     gamma, beta = float(cmdp.gamma), float(cmdp.beta)
     if cmdp.horizon is None and gamma != beta:
         raise ValueError(
@@ -108,16 +115,21 @@ def _same_discounts(cmdp: FiniteCMDP) -> None:
 class Vertex(NamedTuple):
     """A deterministic policy on the concave hull of (danger, return)."""
 
-    danger: float
-    value: float
-    policy: Array  # (H, S, A)
+    danger: float  # expected danger of an episode
+    value: float  # expected return
+    policy: Array  # (H, S, A) probabilities
 
 
 @jax.jit
 def lagrangian(cmdp: FiniteCMDP, toll: Array, prize: Array) -> Values:
-    """The policy of the greatest prize * return - toll * danger, and its values.
+    """Returns the policy that maximises prize * return - toll * danger, and its values.
 
-    gamma and beta may differ: step t weighs prize gamma^t r - toll beta^t d, undiscounted.
+    gamma and beta may differ: step t is weighted by prize gamma^t r - toll beta^t d, undiscounted.
+
+    Args:
+        cmdp: the CMDP.
+        toll: () price of danger.
+        prize: () weight of the return.
     """
     if cmdp.horizon is None:
         signal, discount = prize * cmdp.reward - toll * cmdp.danger, cmdp.gamma
@@ -132,20 +144,20 @@ def lagrangian(cmdp: FiniteCMDP, toll: Array, prize: Array) -> Values:
 
 @jax.jit
 def _point(cmdp: FiniteCMDP, policy: Array) -> tuple[Array, Array]:
-    """() danger and () return of a policy."""
+    """Returns the expected danger and the expected return of a policy, () each."""
     return expected(cmdp, threat(cmdp, policy)), expected(cmdp, returns(cmdp, policy))
 
 
 def frontier(cmdp: FiniteCMDP, upto: float = np.inf) -> list[Vertex]:
-    """The whole Lagrangian curve: the vertices of the concave hull, by rising danger.
+    """Returns the whole Lagrangian curve: the vertices of the concave hull, by rising danger.
 
-    Between neighbours, a coin tossed before the episode reaches every point of the line, and no
-    policy lies above it. All multipliers are covered: the chord of two known vertices is itself
-    a multiplier, and either finds a vertex above it or proves that there is none.
+    Every point of the line between two neighbours is reached by a coin toss before the episode, and
+    no policy lies above the curve. All multipliers are covered: the chord of two known vertices is
+    itself a multiplier, and its policy either lies above the chord or proves that none does.
 
     Args:
         cmdp: the CMDP.
-        upto: only chords that begin before this danger are divided.
+        upto: only chords that begin below this danger are divided further.
 
     Raises:
         ValueError: the horizon is infinite and the discounts differ.
@@ -158,8 +170,8 @@ def frontier(cmdp: FiniteCMDP, upto: float = np.inf) -> list[Vertex]:
         danger, value = _point(cmdp, policy)
         return Vertex(float(danger), float(value), policy)
 
-    # The ends: least danger first, or greatest return first. The other aim, at a weight that
-    # cannot matter but among equals, is the chord's business.
+    # The ends of the curve: one with the least danger, one with the greatest return. Among equals
+    # either may be suboptimal in the other respect; the chords then find the better vertices.
     low, high = vertex(1.0, 0.0), vertex(0.0, 1.0)
     scale = max(1e-300, abs(low.value), abs(high.value), high.danger)
     found, open_chords = [low, high], [(low, high)]
@@ -180,9 +192,9 @@ def frontier(cmdp: FiniteCMDP, upto: float = np.inf) -> list[Vertex]:
 
 
 def _hull(vertices: list[Vertex], rounding: float) -> list[Vertex]:
-    """By rising danger, without what lies on or below a line between others, or falls.
+    """Returns the vertices of the concave hull, by rising danger and rising return.
 
-    Of vertices whose dangers differ by no more than rounding, only the best.
+    Of vertices whose dangers differ by no more than `rounding`, only the best is kept.
     """
     chain: list[Vertex] = []
     for vertex in sorted(vertices, key=lambda v: (v.danger, -v.value)):
@@ -197,12 +209,21 @@ def _hull(vertices: list[Vertex], rounding: float) -> list[Vertex]:
 
 
 def _below(left: Vertex, middle: Vertex, right: Vertex) -> bool:
+    """Returns whether a vertex lies on or below the line between two others."""
     rise = (right.value - left.value) * (middle.danger - left.danger)
     return (middle.value - left.value) * (right.danger - left.danger) <= rise
 
 
 def mixed(vertices: list[Vertex], c: float) -> float:
-    """The greatest return at danger c, policies mixed by a coin; nan below the least danger."""
+    """Returns the greatest return at a given danger, by policies mixed by a coin toss.
+
+    Args:
+        vertices: the Lagrangian curve, from `frontier`.
+        c: bound of the danger of an episode.
+
+    Returns:
+        The return; nan if c is below the least danger.
+    """
     dangers = np.asarray([v.danger for v in vertices])
     if c < dangers[0] - TOLERANCE * max(1.0, dangers[0]):
         return float("nan")
@@ -210,6 +231,14 @@ def mixed(vertices: list[Vertex], c: float) -> float:
 
 
 def unmixed(vertices: list[Vertex], c: float) -> Vertex | None:
-    """The best vertex of danger at most c: what one Lagrange multiplier can reach."""
+    """Returns the best vertex of danger at most c: what a single Lagrange multiplier can reach.
+
+    Args:
+        vertices: the Lagrangian curve, from `frontier`.
+        c: bound of the danger of an episode.
+
+    Returns:
+        The vertex; None if c is below the least danger.
+    """
     within = [v for v in vertices if v.danger <= c + TOLERANCE * max(1.0, c)]
     return within[-1] if within else None

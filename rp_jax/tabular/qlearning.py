@@ -1,6 +1,6 @@
 """Algorithm 4 on a finite CMDP: Q-learning inside the secure sets.
 
-The choices are those of `rp_jax.shield`, as in the deep learner.
+Actions are chosen by `rp_jax.shield`, as in the deep learner.
 """
 
 from typing import NamedTuple
@@ -15,14 +15,18 @@ from rp_jax.validate import number
 
 
 class LearnerState(NamedTuple):
-    """What is carried from step to step."""
+    """The learner's state between two steps."""
 
-    values: Array  # (H, S, A) Q
-    visits: Array  # (H, S, A) int32, how often each was updated
+    values: Array  # (H, S, A) the values Q
+    visits: Array  # (H, S, A) int32, how often each value was updated
 
 
 def init(cmdp: FiniteCMDP) -> LearnerState:
-    """Nothing is known yet."""
+    """Returns a learner with all values 0.
+
+    Args:
+        cmdp: the CMDP.
+    """
     return LearnerState(jnp.zeros(cmdp.shape), jnp.zeros(cmdp.shape, jnp.int32))
 
 
@@ -33,17 +37,18 @@ def step(
     admissible: Array,
     omega: float = 0.7,
 ) -> LearnerState:
-    """One sampled transition and one update (lines 4 to 11).
+    """Samples one transition and makes one update (Algorithm 4, lines 4 to 11).
 
-    The simulator starts anywhere: step and state are drawn uniformly, the action uniformly from
+    The simulator starts anywhere: time and state are drawn uniformly, and the action uniformly from
     the admissible ones. The learning rate is (1 + visits)^-omega.
 
     Args:
-        key: consumed.
-        learner: what is known.
-        cmdp: only sampled from.
-        admissible: (H, S, A) bool; greedy-eta alone at insecure states (lines 7 to 9).
-        omega: in (.5, 1].
+        key: random key.
+        learner: the learner before the step.
+        cmdp: the CMDP, from which it only samples.
+        admissible: (H, S, A) bool; in insecure states only the least threatening action (lines 7 to
+            9).
+        omega: exponent of the learning rate, in (0.5, 1].
     """
     horizon, states, _ = cmdp.shape
     at_time, at_state, at_action, at_next = jax.random.split(key, 4)
@@ -69,10 +74,17 @@ def step(
 def learn(
     key: Array, cmdp: FiniteCMDP, admissible: Array, steps: int, omega: float = 0.7
 ) -> LearnerState:
-    """`steps` steps from nothing; vmap over keys for seeds.
+    """Learns from scratch; may be vmapped over keys for several seeds.
+
+    Args:
+        key: random key.
+        cmdp: the CMDP, from which it only samples.
+        admissible: (H, S, A) bool; in insecure states only the least threatening action.
+        steps: number of steps.
+        omega: exponent of the learning rate, in (0.5, 1].
 
     Raises:
-        ValueError: steps is no positive integer, or omega not in (.5, 1].
+        ValueError: `steps` is not a positive integer, or `omega` is out of range.
     """
     number("steps", steps, least=1, integer=True)
     number("omega", omega, above=0.5, most=1)

@@ -1,7 +1,7 @@
 """Secure sets of time-indexed threats, and the worst that policies inside them can do.
 
-Admissible sets are (H, S, A) bool and never empty: where no action is secure, they hold
-greedy-eta alone (Definition 3).
+Admissible sets are (H, S, A) bool and never empty: in an insecure state, where no action's threat
+is at most x, they hold the action of greedy-eta alone, the least threatening one (Definition 3).
 """
 
 import jax
@@ -15,14 +15,14 @@ from rp_jax.tabular.threat import Values, greedy, solve
 
 
 def secure(action_threat: Array, x: Array | float) -> Shield:
-    """A_t(s) = {a : T_t(s, a) <= x_t} for each step by itself.
+    """Returns the sets A_t(s) = {a : T_t(s, a) <= x_t} of each step.
 
     Args:
-        action_threat: (H, S, A), or any function above it (`thresholds.certified`).
+        action_threat: (H, S, A) threats, or any upper bound of them (`thresholds.certified`).
         x: () or (H,) thresholds.
 
     Returns:
-        The shield's admissible (H, S, A) and secure (H, S).
+        The shield, with admissible (H, S, A) and secure (H, S).
     """
     x = jnp.broadcast_to(x, action_threat.shape[:1])
     over_states = jax.vmap(shield.shield, in_axes=(0, None))
@@ -30,9 +30,16 @@ def secure(action_threat: Array, x: Array | float) -> Shield:
 
 
 def secure_at_all_times(action_threat: Array, x: Array | float) -> Shield:
-    """A(s), the intersection of A_t(s) over the steps (equation 5), and so the same at each.
+    """Returns the sets A(s), the intersection of A_t(s) over all steps (equation 5).
 
-    Where it is empty, greedy-eta of that step, for greedy-eta depends on the step.
+    Where A(s) is empty, it holds the least threatening action of each step, which may differ.
+
+    Args:
+        action_threat: (H, S, A) threats.
+        x: () or (H,) thresholds.
+
+    Returns:
+        The shield, with admissible (H, S, A) and secure (H, S).
     """
     each = secure(action_threat, x)
     always = jnp.all(each.admissible & each.secure[..., None], axis=0)  # (S, A)
@@ -42,31 +49,53 @@ def secure_at_all_times(action_threat: Array, x: Array | float) -> Shield:
 
 
 def secure_by_advantage(threat: Values, y: Array | float) -> Shield:
-    """{a : T_t(s, a) - D_t(s) <= y}, not empty for y >= 0 but for rounding (docs/theory.md)."""
+    """Returns the sets {a : T_t(s, a) - D_t(s) <= y}, never empty for y >= 0 (docs/theory.md).
+
+    Rounding can make one empty; it then holds the least threatening action.
+
+    Args:
+        threat: action threats T and state threats D of the baseline policy.
+        y: () or (H,) thresholds of the difference.
+
+    Returns:
+        The shield, with admissible (H, S, A) and secure (H, S).
+    """
     return secure(threat.action - threat.state[..., None], y)
 
 
 def worst(cmdp: FiniteCMDP, admissible: Array) -> Values:
-    """The threat of the most dangerous policy inside the sets, exactly.
+    """Returns the threats of the most dangerous policy inside the sets, exactly.
 
     Args:
         cmdp: the CMDP.
-        admissible: (H, S, A) bool, not empty.
+        admissible: (H, S, A) bool, nowhere empty.
     """
     return solve(cmdp, cmdp.danger, cmdp.beta, most, admissible)
 
 
 def plan(cmdp: FiniteCMDP, admissible: Array) -> Values:
-    """The P-MDP's best policy inside the sets (equation 10), by value iteration (Algorithm 3).
+    """Returns the best policy inside the sets (equation 10), by value iteration (Algorithm 3).
 
     Args:
         cmdp: the CMDP.
-        admissible: (H, S, A) bool, not empty; greedy-eta alone at insecure states.
+        admissible: (H, S, A) bool, nowhere empty; in insecure states only the least threatening
+            action.
+
+    Returns:
+        The policy with its values.
     """
     return solve(cmdp, cmdp.reward, cmdp.gamma, most, admissible)
 
 
 def most(action: Array, admissible: Array) -> Array:
-    """(S, A) the policy that takes the admissible action of the greatest value."""
+    """Returns the policy that takes the admissible action of the greatest value.
+
+    Args:
+        action: (S, A) values.
+        admissible: (S, A) bool.
+
+    Returns:
+        (S, A) probabilities, 0 or 1.
+    """
     best = jax.vmap(shield.masked_argmax)(action, admissible)
     return jax.nn.one_hot(best, action.shape[-1], dtype=action.dtype)

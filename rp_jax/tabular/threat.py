@@ -1,6 +1,6 @@
 """Threats of policies (equations 3, 4 and 9), by backward induction or by linear equations.
 
-A policy is (S, A), or time-indexed (H, S, A), of probabilities. Everything returned is
+A policy is an array of probabilities, (S, A), or (H, S, A) if it depends on time. All results are
 time-indexed, because threats are: T_0 with a stationary greedy policy is not safe.
 """
 
@@ -14,15 +14,15 @@ from jax import Array
 from rp_jax import shield
 from rp_jax.tabular.cmdp import FiniteCMDP, array_of, distribution
 
-ROUNDS = 1_000  # of policy iteration at most; it ends by itself after few
+ROUNDS = 1_000  # greatest number of rounds of policy iteration; it converges after a few
 
 
 class Values(NamedTuple):
-    """Of the policy that was chosen."""
+    """A policy with its values, or its threats."""
 
-    action: Array  # (H, S, A) as T_t(s, a) or Q_t(s, a)
-    state: Array  # (H, S) as D_t(s) or V_t(s)
-    policy: Array  # (H, S, A)
+    action: Array  # (H, S, A) values of actions, such as T_t(s, a) or Q_t(s, a)
+    state: Array  # (H, S) values of states, such as D_t(s) or V_t(s)
+    policy: Array  # (H, S, A) probabilities
 
 
 def solve(
@@ -32,16 +32,17 @@ def solve(
     choose: Callable[[Array, Any], Array],
     data: Any = None,
 ) -> Values:
-    """Q_t = signal_t + discount P V_{t+1}, V_t = pi_t Q_t, pi_t = choose(Q_t, data_t), V_T = 0.
+    """Computes values of a policy that is chosen from these values, step by step.
 
-    Backward induction for a finite horizon; for the infinite one its fixed point, by policy
-    iteration with exact evaluation.
+    Q_t = signal_t + discount P V_{t+1}, pi_t = choose(Q_t, data_t), V_t = pi_t Q_t, V_T = 0. A
+    finite horizon is solved by backward induction; for the infinite one the fixed point is found by
+    policy iteration with exact evaluation.
 
     Args:
-        cmdp: whose transitions are used.
+        cmdp: the CMDP, of which only the transitions are used.
         signal: (S, A) or (H, S, A), reward or danger of a step.
-        discount: () of the signal.
-        choose: from (S, A) values and this step's data to a policy (S, A).
+        discount: () discount of the signal.
+        choose: maps values (S, A) and this step's data to a policy (S, A).
         data: pytree of (H, ...) arrays.
     """
     signal = jnp.broadcast_to(signal, cmdp.shape)
@@ -63,14 +64,14 @@ def solve(
     signal_0, data_0 = jax.tree.map(lambda leaf: leaf[0], (signal, data))
 
     def improve(carry: tuple[Values, Array, Array]) -> tuple[Values, Array, Array]:
-        """Values of the chosen policy, and what it would choose; not done while that differs."""
+        """Evaluates the chosen policy, and continues while its values lead to a better choice."""
         values, _, rounds = carry
         kernel = jnp.einsum("sa,saz->sz", values.policy, cmdp.transition)
         gain = jnp.sum(values.policy * signal_0, axis=1)
         state = jnp.linalg.solve(jnp.eye(len(kernel)) - discount * kernel, gain)
         action = values_before(signal_0, state)
         policy = choose(action, data_0)
-        # Ties may change hands for ever: no difference beyond rounding ends it too.
+        # Among ties the choice may alternate without end, so rounding errors end it as well.
         better = jnp.abs(jnp.sum(policy * action, axis=1) - state)
         rounding = 32 * jnp.finfo(signal.dtype).eps * jnp.max(jnp.abs(state))
         going = jnp.any(policy != values.policy) & (jnp.max(better) > rounding)
@@ -86,10 +87,17 @@ def solve(
 
 
 def check_policy(cmdp: FiniteCMDP, policy: Any) -> Array:
-    """(H, S, A) a policy, given as that or stationary (S, A).
+    """Returns a policy as a time-indexed array, checked.
+
+    Args:
+        cmdp: the CMDP.
+        policy: (S, A) or (H, S, A) probabilities.
+
+    Returns:
+        (H, S, A) probabilities.
 
     Raises:
-        ValueError: its shape is another, or a row is no distribution.
+        ValueError: the policy has another shape, or a row is not a distribution.
     """
     rows = array_of("policy", policy)
     if rows.shape not in (cmdp.shape, cmdp.shape[1:]):
@@ -100,39 +108,78 @@ def check_policy(cmdp: FiniteCMDP, policy: Any) -> Array:
 
 
 def evaluate(cmdp: FiniteCMDP, signal: Array, discount: Array, policy: Array) -> Values:
-    """Values of one policy, as `check_policy` would pass it: `solve` without a choice."""
+    """Returns the values of a given policy.
+
+    Args:
+        cmdp: the CMDP, of which only the transitions are used.
+        signal: (S, A) or (H, S, A), reward or danger of a step.
+        discount: () discount of the signal.
+        policy: (S, A) or (H, S, A) probabilities.
+    """
     policy = jnp.broadcast_to(policy, cmdp.shape)
     return solve(cmdp, signal, discount, lambda _, given: given, policy)
 
 
 def threat(cmdp: FiniteCMDP, policy: Array) -> Values:
-    """Action threat T_t^pi (equation 3) and state threat D_t^pi (equation 4)."""
+    """Returns action threats T_t^pi (equation 3) and state threats D_t^pi (equation 4) of a policy.
+
+    Args:
+        cmdp: the CMDP.
+        policy: (S, A) or (H, S, A) probabilities.
+    """
     return evaluate(cmdp, cmdp.danger, cmdp.beta, policy)
 
 
 def returns(cmdp: FiniteCMDP, policy: Array) -> Values:
-    """Q_t^pi and V_t^pi of the reward."""
+    """Returns the values Q_t^pi and V_t^pi of a policy's reward.
+
+    Args:
+        cmdp: the CMDP.
+        policy: (S, A) or (H, S, A) probabilities.
+    """
     return evaluate(cmdp, cmdp.reward, cmdp.gamma, policy)
 
 
 def expected(cmdp: FiniteCMDP, values: Values) -> Array:
-    """() E[V_0(s_0)]: of `threat` the danger of an episode, of `returns` its return."""
+    """Returns the expected value of the first state, E[V_0(s_0)], ().
+
+    Args:
+        cmdp: the CMDP.
+        values: from `threat` for the danger of an episode, from `returns` for its return.
+    """
     return cmdp.start @ values.state[0]
 
 
 def uniform(cmdp: FiniteCMDP) -> Array:
-    """(S, A) the uniformly random policy, eta_0 of section 5.2."""
+    """Returns the uniformly random policy, eta_0 of section 5.2, (S, A).
+
+    Args:
+        cmdp: the CMDP.
+    """
     return jnp.full(cmdp.danger.shape, 1 / cmdp.danger.shape[1])
 
 
 def greedy(action_threat: Array) -> Array:
-    """(..., A) greedy-eta as probabilities, for each step by itself (Definition 3)."""
+    """Returns greedy-eta, which takes the least threatening action of each step (Definition 3).
+
+    Args:
+        action_threat: (..., A) threats.
+
+    Returns:
+        (..., A) probabilities, 0 or 1.
+    """
     best = jnp.vectorize(shield.greedy_eta, signature="(a)->()")(action_threat)
     return jax.nn.one_hot(best, action_threat.shape[-1], dtype=action_threat.dtype)
 
 
 def policy_iteration(cmdp: FiniteCMDP, policy: Array, rounds: int) -> list[Array]:
-    """eta_0, eta_1, ..., each greedy with respect to the threat of the one before it."""
+    """Returns policies eta_0, eta_1, ..., each greedy for the threats of the one before it.
+
+    Args:
+        cmdp: the CMDP.
+        policy: (S, A) or (H, S, A), eta_0.
+        rounds: number of policies after eta_0.
+    """
     found = [jnp.broadcast_to(policy, cmdp.shape)]
     for _ in range(rounds):
         found.append(greedy(threat(cmdp, found[-1]).action))
@@ -140,5 +187,9 @@ def policy_iteration(cmdp: FiniteCMDP, policy: Array, rounds: int) -> list[Array
 
 
 def least_threat(cmdp: FiniteCMDP) -> Values:
-    """The threat of eta* (equation 9), the least at every state and step at once."""
+    """Returns the policy eta* with its threats, the least at every state and step (equation 9).
+
+    Args:
+        cmdp: the CMDP.
+    """
     return solve(cmdp, cmdp.danger, cmdp.beta, lambda action, _: greedy(action))

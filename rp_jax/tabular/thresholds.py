@@ -1,6 +1,7 @@
 """Thresholds x under which every policy inside the secure sets keeps the danger at most c.
 
-`c` bounds the discounted danger of an episode, E[sum_t beta^t d(s_t, a_t)] (equation 2).
+The bound c is one of the discounted danger of an episode, E[sum_t beta^t d(s_t, a_t)] (equation 2).
+A policy is called safe if it keeps it.
 """
 
 from collections.abc import Callable
@@ -16,13 +17,20 @@ from rp_jax.tabular.cmdp import FiniteCMDP
 from rp_jax.tabular.threat import Values, check_policy, expected, greedy, solve, threat
 from rp_jax.validate import number
 
-PAPER, TIGHT = 2.0, 1.0  # factors of Theorems 1 and 2: as printed, and as true
+PAPER, TIGHT = 2.0, 1.0  # factors of Theorems 1 and 2: as printed, and the least that is true
 
 
 def effective_horizon(beta: Array | float, horizon: int | None) -> Array:
-    """() sum of beta^k over the steps k, accurate however close beta is to 1.
+    """Returns the sum of beta^k over the steps k, accurate however close beta is to 1.
 
-    (1 - beta^T) / (1 - beta); T at beta = 1; 1 / (1 - beta) for the infinite horizon.
+    It is (1 - beta^T) / (1 - beta); T at beta = 1; and 1 / (1 - beta) for the infinite horizon.
+
+    Args:
+        beta: discount of danger, in [0, 1].
+        horizon: number of steps T, or None for the infinite horizon.
+
+    Returns:
+        ().
     """
     beta = jnp.asarray(beta, float)
     left = 1 - beta
@@ -35,43 +43,54 @@ def effective_horizon(beta: Array | float, horizon: int | None) -> Array:
 
 
 def corollary_1(cmdp: FiniteCMDP, policy: Array, c: Array | float, factor: float = TIGHT) -> Array:
-    """() x of Corollary 1: policies in Pi_G^{eta,x} are safe (equation 6).
-
-    Negative if eta itself is not safe.
+    """Returns the x of Corollary 1, for which policies in Pi_G^{eta,x} are safe (equation 6).
 
     Args:
         cmdp: the CMDP.
-        policy: eta.
-        c: bound on the danger of an episode.
-        factor: 2 as the paper has it, or 1, which is enough (docs/theory.md).
+        policy: (S, A) or (H, S, A), the baseline policy eta.
+        c: bound of the danger of an episode.
+        factor: 2 as in the paper, or 1, which is enough (docs/theory.md).
+
+    Returns:
+        (); negative if eta itself is not safe.
     """
     left = c - expected(cmdp, threat(cmdp, policy))
     return left / (factor * effective_horizon(cmdp.beta, cmdp.horizon))
 
 
 def corollary_2(cmdp: FiniteCMDP, policy: Array, c: Array | float, factor: float = TIGHT) -> Array:
-    """() x of Corollary 2: policies in Pi^{eta,x} are safe (equation 8).
+    """Returns the x of Corollary 2, for which policies in Pi^{eta,x} are safe (equation 8).
 
-    Arguments as for `corollary_1`; it is greedy-eta that must be safe here.
+    Args:
+        cmdp: the CMDP.
+        policy: (S, A) or (H, S, A), the baseline policy eta.
+        c: bound of the danger of an episode.
+        factor: 2 as in the paper, or 1, which is enough (docs/theory.md).
+
+    Returns:
+        (); negative if greedy-eta is not safe.
     """
     return corollary_1(cmdp, greedy(threat(cmdp, policy).action), c, factor)
 
 
 class Certificate(NamedTuple):
-    """What any function U above the threat guarantees (docs/theory.md, the certificate)."""
+    """The bound of danger that any function U of threats guarantees (docs/theory.md)."""
 
-    least: Array  # (H, S) m_t = min_a U_t
-    excess: Array  # (H, S, A) e_t, by which U fails U_t >= d + beta E[m_{t+1}]
-    state: Array  # (H, S) bound on D_t of every policy inside the secure sets of U at x
+    least: Array  # (H, S) least values m_t = min_a U_t
+    excess: Array  # (H, S, A) e_t >= 0, by how much U violates U_t >= d + beta E[m_{t+1}]
+    state: Array  # (H, S) bound of D_t for every policy inside the secure sets of U at x
 
 
 def certificate(cmdp: FiniteCMDP, upper: Array, x: Array | float) -> Certificate:
-    """D_t <= m_t + sum_k beta^{k-t} E[1_S (x_k - m_k) + e_k], at its worst policy.
+    """Returns the bound of the danger of all policies inside the secure sets of a function U.
+
+    The bound is D_t <= m_t + sum_k beta^{k-t} E[1_S (x_k - m_k) + e_k], at the policy for which the
+    right-hand side is greatest; 1_S is 1 in secure states.
 
     Args:
         cmdp: the CMDP.
-        upper: (H, S, A) U >= 0: the threat of a policy, a sum of sub-threats, a learned
-            model and a margin, or anything else.
+        upper: (H, S, A) U >= 0: the threat of a policy, a sum of sub-threats, a learned model with
+            a margin, or anything else.
         x: () or (H,) thresholds.
     """
     least, excess = _excess(cmdp, upper)
@@ -83,9 +102,16 @@ def certificate(cmdp: FiniteCMDP, upper: Array, x: Array | float) -> Certificate
 
 
 def backup(cmdp: FiniteCMDP, upper: Array) -> Array:
-    """(H, S, A) d + beta E[m_{t+1}], one step of value iteration on U's least actions.
+    """Returns the Bellman backup d + beta E[m_{t+1}] of a function U, where m is its least value.
 
-    If U's excess is e, that of any mixture of U and the lesser of both is at most e.
+    If the excess of U is e, then that of any mixture of U and min(U, backup) is at most e.
+
+    Args:
+        cmdp: the CMDP.
+        upper: (H, S, A) U.
+
+    Returns:
+        (H, S, A).
     """
     least = upper.min(axis=-1)
     ahead = least if cmdp.horizon is None else jnp.append(least[1:], 0 * least[:1], axis=0)
@@ -93,33 +119,44 @@ def backup(cmdp: FiniteCMDP, upper: Array) -> Array:
 
 
 def _excess(cmdp: FiniteCMDP, upper: Array) -> tuple[Array, Array]:
-    """(H, S) m and (H, S, A) e."""
+    """Returns the least values m (H, S) and the excess e (H, S, A) of U."""
     return upper.min(axis=-1), jnp.maximum(backup(cmdp, upper) - upper, 0.0)
 
 
 def certified(cmdp: FiniteCMDP, upper: Array, c: Array | float) -> Array:
-    """() x that the certificate allows whatever the policy and wherever it goes.
+    """Returns the x that the certificate allows, whatever the policy inside the sets does.
 
-    (c - E[m_0]) / sum_k beta^k - max e: for U = T^eta it is Corollary 2 with E[m_0] in place of
-    D^{greedy-eta}. Negative if there is none.
+    It is (c - E[m_0]) / sum_k beta^k - max e. For U = T^eta that is Corollary 2 with E[m_0] in
+    place of the danger of greedy-eta.
+
+    Args:
+        cmdp: the CMDP.
+        upper: (H, S, A) U, as for `certificate`.
+        c: bound of the danger of an episode.
+
+    Returns:
+        (); negative if there is no threshold.
     """
     least, excess = _excess(cmdp, upper)
     return (c - cmdp.start @ least[0]) / effective_horizon(cmdp.beta, cmdp.horizon) - excess.max()
 
 
 def evaluated(cmdp: FiniteCMDP, upper: Array, c: Array | float) -> Array:
-    """() the largest x of use whose WORST admissible policy keeps E[D_0] <= c.
+    """Returns the largest useful x whose most dangerous admissible policy keeps E[D_0] <= c.
 
-    The sets of each step grow only at x equal to a value of `upper`, and the worst danger never
-    falls as they grow; so it is a bisection over the sorted values, exact. (The intersections of
-    equation 5 are not nested, and would not do.) Minus infinity (greedy-eta
-    everywhere) if no value will do; nan if greedy-eta itself is not safe.
+    The sets of each step grow only where x equals a value of `upper`, and the greatest danger never
+    falls as they grow. So bisection over the sorted values finds x exactly. (The intersections of
+    equation 5 are not nested, and bisection would fail.)
 
     Args:
         cmdp: the CMDP.
-        upper: (H, S, A) threats, or threats less the state's (then x is the y of
-            `secure_by_advantage`).
-        c: bound on the danger of an episode.
+        upper: (H, S, A) threats; or threats less those of the state, for which x is the y of
+            `secure_by_advantage`.
+        c: bound of the danger of an episode.
+
+    Returns:
+        (); minus infinity (greedy-eta everywhere) if no value is small enough; nan if greedy-eta
+        itself is not safe.
     """
     values = jnp.sort(upper.ravel())
 
@@ -140,39 +177,69 @@ def evaluated(cmdp: FiniteCMDP, upper: Array, c: Array | float) -> Array:
 
 
 class Rule(NamedTuple):
-    """A way to the admissible sets for a bound c."""
+    """The threshold and the admissible sets that a rule chooses for a bound c."""
 
-    x: Array  # () the threshold, or y
-    shield: Shield
+    x: Array  # () the threshold x, or y of `secure_by_advantage`
+    shield: Shield  # the admissible sets
 
 
 def paper(cmdp: FiniteCMDP, policy: Array, c: Array | float) -> Rule:
-    """Corollary 2 as printed, with the sets of equation 5."""
+    """Applies Corollary 2 as printed, with the sets of equation 5.
+
+    Args:
+        cmdp: the CMDP.
+        policy: (S, A) or (H, S, A), the baseline policy eta.
+        c: bound of the danger of an episode.
+    """
     x = corollary_2(cmdp, policy, c, PAPER)
     return Rule(x, sets.secure_at_all_times(threat(cmdp, policy).action, x))
 
 
 def tight(cmdp: FiniteCMDP, policy: Array, c: Array | float) -> Rule:
-    """Corollary 2 with factor 1, with the sets of equation 5."""
+    """Applies Corollary 2 with factor 1, with the sets of equation 5.
+
+    Args:
+        cmdp: the CMDP.
+        policy: (S, A) or (H, S, A), the baseline policy eta.
+        c: bound of the danger of an episode.
+    """
     x = corollary_2(cmdp, policy, c)
     return Rule(x, sets.secure_at_all_times(threat(cmdp, policy).action, x))
 
 
 def per_step(cmdp: FiniteCMDP, policy: Array, c: Array | float) -> Rule:
-    """Corollary 2 with factor 1, and each step's own sets."""
+    """Applies Corollary 2 with factor 1, with the sets of each step.
+
+    Args:
+        cmdp: the CMDP.
+        policy: (S, A) or (H, S, A), the baseline policy eta.
+        c: bound of the danger of an episode.
+    """
     x = corollary_2(cmdp, policy, c)
     return Rule(x, sets.secure(threat(cmdp, policy).action, x))
 
 
 def by_evaluation(cmdp: FiniteCMDP, policy: Array, c: Array | float) -> Rule:
-    """The largest x that the worst policy allows, and each step's own sets."""
+    """Finds the largest x that the most dangerous policy allows, with the sets of each step.
+
+    Args:
+        cmdp: the CMDP.
+        policy: (S, A) or (H, S, A), the baseline policy eta.
+        c: bound of the danger of an episode.
+    """
     action = threat(cmdp, policy).action
     x = evaluated(cmdp, action, c)
     return Rule(x, sets.secure(action, x))
 
 
 def by_advantage(cmdp: FiniteCMDP, policy: Array, c: Array | float) -> Rule:
-    """The largest y with T - D <= y that the worst policy allows."""
+    """Finds the largest y for which the sets T - D <= y are safe, with these sets.
+
+    Args:
+        cmdp: the CMDP.
+        policy: (S, A) or (H, S, A), the baseline policy eta.
+        c: bound of the danger of an episode.
+    """
     values = threat(cmdp, policy)
     advantage = values.action - values.state[..., None]
     y = evaluated(cmdp, advantage, c)
@@ -194,17 +261,20 @@ def reconnoitre_and_plan(
     policy: Array,
     rule: Callable[[FiniteCMDP, Array, Array | float], Rule] = paper,
 ) -> tuple[Rule, Values]:
-    """Algorithm 1: the secure sets of a baseline policy, and the best policy inside them.
+    """Computes Algorithm 1: the secure sets of a baseline policy, and the best policy inside them.
 
     Args:
         cmdp: the CMDP.
-        c: bound on the danger of an episode.
-        policy: eta; `least_threat(cmdp).policy` is eta*.
-        rule: one of RULES.
+        c: bound of the danger of an episode.
+        policy: (S, A) or (H, S, A), the baseline policy eta; `least_threat(cmdp).policy` is eta*.
+        rule: one of `RULES`.
+
+    Returns:
+        The threshold and the sets that the rule chooses, and the best policy with its values.
 
     Raises:
-        ValueError: c or the policy is out of range, or the baseline policy is not safe: not even
-            greedy-eta keeps the danger at most c, so that there is no threshold.
+        ValueError: c or the policy is out of range; or there is no threshold, since not even
+            greedy-eta keeps the danger at most c.
     """
     number("c", c, least=0)
     policy = check_policy(cmdp, policy)
@@ -223,9 +293,18 @@ def planned(
     policy: Array,
     rule: Callable[[FiniteCMDP, Array, Array | float], Rule] = paper,
 ) -> tuple[Rule, Values]:
-    """`reconnoitre_and_plan` without its checks, for jit and vmap.
+    """Computes Algorithm 1 without checks, for jit and vmap; see `reconnoitre_and_plan`.
 
-    Where the baseline policy is not safe (x negative or nan), the plan keeps no bound.
+    Where the baseline policy is not safe (x negative or nan), the result keeps no bound.
+
+    Args:
+        cmdp: the CMDP.
+        c: bound of the danger of an episode.
+        policy: (S, A) or (H, S, A), the baseline policy eta.
+        rule: one of `RULES`.
+
+    Returns:
+        The threshold and the sets that the rule chooses, and the best policy with its values.
     """
     chosen = rule(cmdp, policy, c)
     return chosen, sets.plan(cmdp, chosen.shield.admissible)

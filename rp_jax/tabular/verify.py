@@ -1,8 +1,8 @@
-"""Every theorem of docs/theory.md, checked on CMDPs against the exact worst policy.
+"""All theorems of docs/theory.md, checked on CMDPs against the exact most dangerous policy.
 
-Each check takes one instance and returns by how much it is violated, at most rounding if the
-theorem holds; callers vmap. Names of other modules are looked up when a check is traced, so a
-test can put a wrong implementation in place of a right one and see the check fail.
+Each check takes one instance and returns by how much the theorem is violated: no more than rounding
+errors if it holds. Callers vmap. Names of other modules are looked up when a check is traced, so
+that a test can replace a right implementation by a wrong one and see the check fail.
 """
 
 from collections.abc import Callable
@@ -16,26 +16,32 @@ from rp_jax.tabular import factored, secure, threat, thresholds
 from rp_jax.tabular.cmdp import FiniteCMDP
 
 BETAS = (0.0, 0.5, 0.9, 0.999, 1 - 1e-6, 1.0)
-NEAR_1 = 1 - 1e-4  # without end: nearer to 1, double precision itself errs by more than is allowed
+NEAR_1 = 1 - 1e-4  # greatest beta without a horizon: nearer to 1, rounding errors are too large
 
 
 class Instance(NamedTuple):
-    """A CMDP, a baseline policy eta, a threshold, a bound, and another policy."""
+    """An instance for the checks: a CMDP, two policies, and numbers for thresholds and bounds."""
 
     cmdp: FiniteCMDP
-    eta: Array  # (H, S, A)
-    other: Array  # (H, S, A)
-    x: Array  # (H,)
+    eta: Array  # (H, S, A) the baseline policy
+    other: Array  # (H, S, A) another policy
+    x: Array  # (H,) thresholds
     share: Array  # () in [0, 2), from which `_bound` makes c
     noise: Array  # (H, S, A) in [0, 1)
 
 
 def draw(key: Array, states: int, actions: int, horizon: int | None) -> Instance:
-    """A random instance of sparse transitions, with ties, absorbing states and free actions.
+    """Draws an instance with sparse transitions, ties, absorbing states and actions without danger.
 
-    beta is one of BETAS or uniform; x is 0, a value of the threat itself or just below one, or
-    uniform, and in a share of the instances another at each step. In a share the bounds are
-    reached: eta takes a free action, all others cost the same.
+    beta is one of `BETAS` or uniform. x is 0, a value of the threat itself or just below one, or
+    uniform; in some of the instances it differs from step to step. In some the bounds are attained:
+    eta takes an action without danger, and all others have the same danger.
+
+    Args:
+        key: random key.
+        states: number of states.
+        actions: number of actions.
+        horizon: number of steps, or None for the infinite horizon.
     """
     keys = iter(jax.random.split(key, 28))
     shape = (states, actions, states)
@@ -45,7 +51,7 @@ def draw(key: Array, states: int, actions: int, horizon: int | None) -> Instance
         return jax.random.bernoulli(next(keys), p, shape)
 
     def simplex(key: Array, sparse: Array) -> Array:
-        """Rows that sum to 1, with zeros, some of them deterministic."""
+        """Draws rows that sum to 1, with zeros; some of them are deterministic."""
         weight = jax.random.exponential(key, sparse.shape)
         kept = jnp.where(sparse, weight, 0.0)
         kept = jnp.where(kept.sum(-1, keepdims=True) > 0, kept, weight)
@@ -100,7 +106,7 @@ def draw(key: Array, states: int, actions: int, horizon: int | None) -> Instance
 def _worst_drift(
     cmdp: FiniteCMDP, x: Array, at_secure: Callable, elsewhere: Callable, data: tuple
 ) -> Array:
-    """(H, S) max over policies of E[sum beta^k (d_k - x_k z_k)]; z is 0 where it is not secure."""
+    """Returns max E[sum beta^k (d_k - x_k z_k)] over policies, (H, S); z is 0 where insecure."""
 
     def back(after: Array, now: tuple) -> tuple[Array, Array]:
         (allowed, given), x = now
@@ -113,13 +119,14 @@ def _worst_drift(
 
 
 def _riskiest(action: Array, threats: Array, most: Array) -> Array:
-    """(S, A) the policy of the greatest p.Q among those with p.T <= most (F^eta of equation 6).
+    """Returns the policy of the greatest p.Q among those with p.T <= most, (S, A).
 
-    A linear program in one constraint: one action, or a mixture of two.
+    These policies are F^eta of equation 6. The problem is a linear program with one constraint,
+    solved by one action or a mixture of two.
 
     Args:
-        action: (S, A) Q.
-        threats: (S, A) T.
+        action: (S, A) values Q.
+        threats: (S, A) threats T.
         most: (S,) bound.
     """
     actions = action.shape[1]
@@ -135,21 +142,28 @@ def _riskiest(action: Array, threats: Array, most: Array) -> Array:
 
 
 def _drifting(action: Array, admissible: Array, eta: Array, x: Array) -> Array:
-    """(S,) max over p inside the set of p.Q - x d_TV(p, eta): concave, so not at a corner.
+    """Returns the maximum of p.Q - x d_TV(p, eta) over policies p inside the sets, (S,).
 
-    Where eta itself goes, mass is free of charge up to eta's own; all else costs x, and goes to
-    the best action.
+    The function is concave, so that its maximum need not be at a corner. Probability is free of
+    charge up to eta's own; all else costs x, and goes to the best action.
     """
     best = jnp.max(jnp.where(admissible, action, -jnp.inf), axis=1) - x
     kept = jnp.where(admissible, eta, 0.0)
     return jnp.sum(kept * jnp.maximum(action, best[:, None]), axis=1) + best * (1 - kept.sum(1))
 
 
-SETS = ("secure", "secure_at_all_times")  # of each step, and of all steps (equation 5)
+SETS = ("secure", "secure_at_all_times")  # sets of each step, and of all steps (equation 5)
 
 
 def theorem_1(case: Instance) -> Array:
-    """D^pi <= D^eta + sum beta^{k-t} x_k E[z_k] for all pi in Pi_G, with factor 1 (finite T)."""
+    """Checks D^pi <= D^eta + sum beta^{k-t} x_k E[z_k] for all pi in Pi_G, with factor 1.
+
+    Args:
+        case: an instance with a finite horizon.
+
+    Returns:
+        () the violation.
+    """
     cmdp, eta, x = case.cmdp, case.eta, case.x
     found = threat.threat(cmdp, eta)
 
@@ -169,7 +183,14 @@ def theorem_1(case: Instance) -> Array:
 
 
 def theorem_2(case: Instance) -> Array:
-    """D^pi <= D^greedy + sum beta^{k-t} x_k E[z^g_k] for all pi in Pi (finite T)."""
+    """Checks D^pi <= D^greedy + sum beta^{k-t} x_k E[z^g_k] for all pi in Pi, with factor 1.
+
+    Args:
+        case: an instance with a finite horizon.
+
+    Returns:
+        () the violation.
+    """
     cmdp, x = case.cmdp, case.x
     found = threat.threat(cmdp, case.eta)
     greedy = threat.greedy(found.action)
@@ -186,24 +207,38 @@ def theorem_2(case: Instance) -> Array:
 
 
 def _danger(case: Instance, values: threat.Values) -> Array:
+    """Returns the expected danger of an episode, ()."""
     return threat.expected(case.cmdp, values)
 
 
 def _steps(cmdp: FiniteCMDP) -> Array:
-    """() sum of beta^k, term by term."""
+    """Returns the sum of beta^k, (), added term by term."""
     if cmdp.horizon is None:
         return 1 / (1 - cmdp.beta)
     return jnp.sum(cmdp.beta ** jnp.arange(cmdp.horizon))
 
 
 def _bound(case: Instance, danger: Array) -> Array:
-    """() c: in a tenth of the instances below the danger; else above by what makes x[0] the x."""
+    """Returns a bound c, ().
+
+    In a tenth of the instances it is below the given danger; in the others, above it by what makes
+    x[0] the threshold.
+    """
     above = danger + case.x[0] * _steps(case.cmdp)
     return jnp.where(case.share < 0.2, 5 * case.share * danger, above)
 
 
 def corollary_1(case: Instance) -> Array:
-    """With its x, the worst policy of Pi_G keeps c; below E[D^eta] there is no x >= 0."""
+    """Checks that under Corollary 1's x the most dangerous policy of Pi_G keeps c.
+
+    Below E[D^eta] there must be no x >= 0.
+
+    Args:
+        case: an instance.
+
+    Returns:
+        () the violation.
+    """
     cmdp = case.cmdp
     found = threat.threat(cmdp, case.eta)
     c = _bound(case, _danger(case, found))
@@ -224,7 +259,17 @@ def corollary_1(case: Instance) -> Array:
 
 
 def corollary_2(case: Instance) -> Array:
-    """With its x, the worst policy of Pi keeps c; and with the intersection of equation 5."""
+    """Checks that under Corollary 2's x the most dangerous policy of Pi keeps c.
+
+    It is also checked for the intersections of equation 5. Below the danger of greedy-eta there
+    must be no x >= 0.
+
+    Args:
+        case: an instance.
+
+    Returns:
+        () the violation.
+    """
     cmdp = case.cmdp
     found = threat.threat(cmdp, case.eta)
     safest = _danger(case, threat.threat(cmdp, threat.greedy(found.action)))
@@ -238,7 +283,14 @@ def corollary_2(case: Instance) -> Array:
 
 
 def corollary_3(case: Instance) -> Array:
-    """eta* is safe whenever any policy is, and so is all of its Pi."""
+    """Checks that eta* and all policies of its Pi are safe whenever any policy is.
+
+    Args:
+        case: an instance.
+
+    Returns:
+        () the violation.
+    """
     cmdp = case.cmdp
     star = threat.least_threat(cmdp)
     others = [threat.threat(cmdp, policy).state for policy in (case.eta, case.other)]
@@ -250,9 +302,15 @@ def corollary_3(case: Instance) -> Array:
 
 
 def certificate(case: Instance) -> Array:
-    """Its bound holds at every state, for U above or below the threat, and so does its x.
+    """Checks the certificate's bound at every state, and its x, for U above or below the threat.
 
-    A Bellman backup where nothing is secure adds no excess.
+    A Bellman backup in insecure states must add no excess.
+
+    Args:
+        case: an instance.
+
+    Returns:
+        () the violation.
     """
     cmdp, x = case.cmdp, case.x
     found = threat.threat(cmdp, case.eta).action
@@ -271,14 +329,30 @@ def certificate(case: Instance) -> Array:
 
 
 def looked_ahead(cmdp: FiniteCMDP, upper: Array, x: Array | float) -> Array:
-    """(H, S, A) U, and where no action of it is at most x, the lesser of it and its backup."""
+    """Returns U, replaced by the lesser of it and its backup where no action of it is at most x.
+
+    Args:
+        cmdp: the CMDP.
+        upper: (H, S, A) U.
+        x: () or (H,) thresholds.
+
+    Returns:
+        (H, S, A).
+    """
     secure_at = secure.secure(upper, x).secure[..., None]
     lesser = jnp.minimum(upper, thresholds.backup(cmdp, upper))
     return jnp.where(secure_at, upper, lesser)
 
 
 def advantage(case: Instance) -> Array:
-    """{a : T - D <= y} keeps D^pi <= D^eta + y sum beta^k."""
+    """Checks that the sets {a : T - D <= y} keep D^pi <= D^eta + y sum beta^k.
+
+    Args:
+        case: an instance; its x is y.
+
+    Returns:
+        () the violation.
+    """
     cmdp, y = case.cmdp, case.x
     found = threat.threat(cmdp, case.eta)
     reached = secure.worst(cmdp, secure.secure_by_advantage(found, y).admissible)
@@ -288,7 +362,14 @@ def advantage(case: Instance) -> Array:
 
 
 def evaluated(case: Instance) -> Array:
-    """The evaluated x keeps c at its worst policy, and the next greater value does not."""
+    """Checks that the evaluated x keeps c at its most dangerous policy, and no greater x does.
+
+    Args:
+        case: an instance.
+
+    Returns:
+        () the violation.
+    """
     cmdp = case.cmdp
     found = threat.threat(cmdp, case.eta).action
     safest = _danger(case, threat.threat(cmdp, threat.greedy(found)))
@@ -316,13 +397,24 @@ CHECKS: dict[str, Callable[[Instance], Array]] = {
     "evaluated": evaluated,
 }
 
-FINITE = ("theorem 1", "theorem 2")  # z is counted step by step: for a finite horizon only
+FINITE = ("theorem 1", "theorem 2")  # for a finite horizon only, since z is counted step by step
 
 
 def draw_factored(
     key: Array, states: int, actions: int, hazards: int, horizon: int | None
 ) -> tuple[factored.Factored, Array]:
-    """A random factored model of `states` states of agent and of each hazard, and eta^(o)."""
+    """Draws a factored model and a baseline policy eta^(o).
+
+    Args:
+        key: random key.
+        states: number of states of the body, and of each hazard.
+        actions: number of actions.
+        hazards: number of hazards.
+        horizon: number of steps, or None for the infinite horizon.
+
+    Returns:
+        The model, and the policy (H, So, A).
+    """
     keys = iter(jax.random.split(key, 5 + 3 * hazards))
 
     def simplex(*shape: int) -> Array:
@@ -330,7 +422,7 @@ def draw_factored(
 
     beta = jax.random.choice(next(keys), jnp.asarray(BETAS))
     model = factored.Factored(
-        agent=simplex(states, actions, states),
+        body=simplex(states, actions, states),
         reward=jax.random.normal(next(keys), (states, actions)),
         start=simplex(states),
         hazards=[
@@ -348,15 +440,18 @@ def draw_factored(
 
 
 def theorem_3(model: factored.Factored, etas: Array, x: Array) -> Array:
-    """T^eta <= sum_n T^{eta,n}; and Algorithm 2's policies, inside the sums' sets, keep c.
+    """Checks T^eta <= sum_n T^{eta,n}, and that Algorithm 2's policies keep c.
 
-    The sum is an upper function of the certificate with no excess, and so is the least sum of
-    several plans, also where it is looked one step ahead. A share, as `violations`.
+    The sum must fulfil the certificate without excess; so must the least sum of several plans, also
+    after a look-ahead by one step.
 
     Args:
-        model: of agent and hazards.
-        etas: (2, H, So, A) two plans.
-        x: () from which c is made.
+        model: the body and its hazards.
+        etas: (2, H, So, A) two baseline policies.
+        x: () threshold, from which c is made.
+
+    Returns:
+        () the violation, as a fraction of the greatest danger that an episode can have.
     """
     cmdp = factored.joint(model)
     totals, broken = [], []
@@ -375,9 +470,19 @@ def theorem_3(model: factored.Factored, etas: Array, x: Array) -> Array:
 
 
 def violations(key: Array, states: int, actions: int, horizon: int | None) -> dict[str, Array]:
-    """By check, by how much it is violated on one random instance.
+    """Returns the violation of each check on one random instance.
 
-    As a share of the greatest danger an episode can have, so that rounding looks alike for all.
+    Violations are fractions of the greatest danger that an episode can have, so that rounding
+    errors are alike for all instances.
+
+    Args:
+        key: random key.
+        states: number of states.
+        actions: number of actions.
+        horizon: number of steps, or None for the infinite horizon.
+
+    Returns:
+        The violations () by the name of the check.
     """
     case = draw(key, states, actions, horizon)
     greatest = thresholds.effective_horizon(case.cmdp.beta, horizon)
@@ -388,7 +493,19 @@ def violations(key: Array, states: int, actions: int, horizon: int | None) -> di
 def violations_of_theorem_3(
     key: Array, states: int, actions: int, hazards: int, horizon: int | None
 ) -> dict[str, Array]:
-    """As `violations`, on one random factored model."""
+    """Returns the violation of Theorem 3 on one random factored model.
+
+    Args:
+        key: random key.
+        states: number of states of the body, and of each hazard.
+        actions: number of actions.
+        hazards: number of hazards.
+        horizon: number of steps, or None for the infinite horizon.
+
+    Returns:
+        The violation () by the name of the check, as a fraction of the greatest danger that an
+        episode can have.
+    """
     model_key, other_key, x_key = jax.random.split(key, 3)
     model, eta = draw_factored(model_key, states, actions, hazards, horizon)
     other = jax.random.dirichlet(other_key, jnp.ones(actions), eta.shape[:-1])

@@ -1,1 +1,1 @@
-"""Threat functions: learned per kind of hazard, summed over hazards (Theorem 3)."""
+"""Threat functions: learned for each kind of hazard, and summed over hazards (Theorem 3)."""

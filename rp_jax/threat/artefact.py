@@ -1,6 +1,5 @@
-"""A learned threat function as a file of its own, to be used again with other x, tracks, counts."""
+"""Learned threat functions as files, for use with other thresholds, tracks or hazard counts."""
 
-import dataclasses
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rp_jax import storage
+from rp_jax.dynamics import num_threats
 from rp_jax.hazards import SubRMDP
 from rp_jax.threat.model import ACTIVATIONS, DEEPEST, WIDEST, ThreatModel, ThreatNetwork
 
@@ -24,77 +24,129 @@ def save(
     subs: Mapping[str, SubRMDP],
     about: Mapping[str, Any],
 ) -> None:
-    """Saves the models of all kinds of hazard, with the sub-R-MDPs they hold for.
+    """Saves the models of all kinds of hazard, with the sub-R-MDPs that they hold for.
 
     Args:
-        folder: created if missing.
-        environment: name that `load` asks for again.
-        models: by kind.
-        subs: by kind.
-        about: anything else worth keeping, such as reports.
+        folder: created if it is missing.
+        environment: name of the environment; `load` can ask for it again.
+        models: the models by kind of hazard.
+        subs: the sub-R-MDPs by kind of hazard.
+        about: other facts worth keeping, such as reports.
+
+    Raises:
+        storage.StorageError: the folder or a file cannot be written.
     """
     networks = {
         kind: {"hidden": model.network.hidden, "activation": model.network.activation}
         for kind, model in models.items()
     }
     tree = {kind: {"model": models[kind], "sub": subs[kind]} for kind in models}
-    statics = {kind: _statics(subs[kind]) for kind in models}
+    statics = {kind: _texts(subs[kind]) for kind in models}
     facts = {"environment": environment, "networks": networks, "statics": statics, **about}
     storage.save(folder, KIND, tree, facts)
 
 
-def load(folder: Path, environment: str, subs: Mapping[str, SubRMDP]) -> dict[str, ThreatModel]:
-    """The models that `save` wrote.
+def load(
+    folder: Path, environment: str | None, subs: Mapping[str, SubRMDP]
+) -> dict[str, ThreatModel]:
+    """Loads the models that `save` wrote.
+
+    Args:
+        folder: the folder given to `save`.
+        environment: the name given to `save`; None accepts any name.
+        subs: the sub-R-MDPs that the models must hold for, by kind of hazard.
+
+    Returns:
+        The models by kind of hazard.
 
     Raises:
         storage.StorageError: the file is damaged, or holds for another environment, other
             dynamics, another baseline policy or other hazards.
     """
-    about = storage.read_manifest(folder, KIND)["about"]
-    if about.get("environment") != environment:
+    known = about(folder)
+    if environment is not None and known.get("environment") != environment:
         raise storage.StorageError(
-            f"{folder}: environment is {about.get('environment')!r}; it must be {environment!r}"
+            f"{folder}: environment is {known.get('environment')!r}; it must be {environment!r}"
         )
-    networks = about.get("networks")
-    if not isinstance(networks, dict) or set(networks) != set(subs):
-        kinds = sorted(networks) if isinstance(networks, dict) else networks
-        raise storage.StorageError(f"{folder}: hazards are {kinds}; they must be {sorted(subs)}")
+    networks: Any = known.get("networks")
+    same_kinds(str(folder), networks, subs)
     for kind, sub in subs.items():
-        _same_statics(f"{folder}: {kind}", about.get("statics", {}), kind, sub)
+        _same_statics(f"{folder}: {kind}", known.get("statics", {}), kind, sub)
     like = {
         kind: {"model": _blank(folder, kind, networks[kind], sub), "sub": sub}
         for kind, sub in subs.items()
     }
     tree = storage.load(folder, KIND, like)
     for kind, sub in subs.items():
-        wanted, found = storage.leaves(sub), storage.leaves(tree[kind]["sub"])
-        for name, value in wanted.items():
-            if not np.allclose(value, found[name], rtol=1e-5, atol=1e-7):
-                raise storage.StorageError(
-                    f"{folder}: {kind}: {name} is {found[name].tolist()}; for this environment "
-                    f"it must be {value.tolist()}"
-                )
+        same_sub(f"{folder}: {kind}", tree[kind]["sub"], sub)
     return {kind: tree[kind]["model"] for kind in subs}
 
 
-def _statics(part: Any, path: str = "") -> dict[str, str]:
-    """What a tree of dataclasses holds that is no array (a horizon, a body's model), by path."""
-    found: dict[str, str] = {}
-    for field in dataclasses.fields(part) if dataclasses.is_dataclass(part) else ():
-        value, name = getattr(part, field.name), path + field.name
-        if field.metadata.get("pytree_node", True):
-            found |= _statics(value, f"{name}/")
-        else:
-            found[name] = str(value)
-    return found
+def about(folder: Path) -> dict[str, Any]:
+    """Returns the facts that were saved with a threat function: reports, settings, networks.
+
+    Args:
+        folder: the folder given to `save`.
+
+    Raises:
+        storage.StorageError: there is no threat function, or it is damaged.
+    """
+    return storage.read_manifest(folder, KIND)["about"]
+
+
+def same_kinds(where: str, found: Any, subs: Mapping[str, SubRMDP]) -> None:
+    """Raises StorageError unless a threat function has an environment's kinds of hazard.
+
+    Args:
+        where: beginning of the message.
+        found: the threat function's table with an entry for each kind of hazard.
+        subs: the environment's sub-R-MDPs by kind of hazard.
+
+    Raises:
+        storage.StorageError: the kinds differ.
+    """
+    if not isinstance(found, Mapping) or set(found) != set(subs):
+        kinds = sorted(found) if isinstance(found, Mapping) else found
+        raise storage.StorageError(f"{where}: hazards are {kinds}; they must be {sorted(subs)}")
+
+
+def same_sub(where: str, found: SubRMDP, wanted: SubRMDP) -> None:
+    """Raises StorageError unless two sub-R-MDPs are equal up to rounding.
+
+    Args:
+        where: beginning of the message.
+        found: the threat function's sub-R-MDP.
+        wanted: the environment's sub-R-MDP.
+
+    Raises:
+        storage.StorageError: a number or a static field differs; the message names it.
+    """
+    have = storage.leaves(found)
+    known = {name: str(value) for name, value in storage.statics(found).items()}
+    for name, value in storage.statics(wanted).items():
+        if known.get(name, str(value)) != str(value):
+            raise storage.StorageError(
+                f"{where}: {name} is {known[name]}; for this environment it must be {value}"
+            )
+    for name, value in storage.leaves(wanted).items():
+        there = have.get(name)
+        if (
+            there is None
+            or there.shape != value.shape
+            or not np.allclose(value, there, rtol=1e-5, atol=1e-7)
+        ):
+            shown = None if there is None else there.tolist()
+            raise storage.StorageError(
+                f"{where}: {name} is {shown}; for this environment it must be {value.tolist()}"
+            )
 
 
 def _same_statics(where: str, saved: Any, kind: str, sub: SubRMDP) -> None:
-    """Raises StorageError if something differs that was saved; earlier versions saved nothing."""
+    """Raises StorageError if a saved static field differs; files of earlier versions have none."""
     known = saved.get(kind, {}) if isinstance(saved, dict) else None
     if not isinstance(known, dict):
         raise storage.StorageError(f"{where}: statics is {known!r}; it must be a table")
-    for name, value in _statics(sub).items():
+    for name, value in _texts(sub).items():
         if (found := known.get(name, value)) != value:
             shown, wanted = (textwrap.shorten(str(text), 80) for text in (found, value))
             raise storage.StorageError(
@@ -102,8 +154,13 @@ def _same_statics(where: str, saved: Any, kind: str, sub: SubRMDP) -> None:
             )
 
 
+def _texts(sub: SubRMDP) -> dict[str, str]:
+    """Returns the static fields of a sub-R-MDP (a horizon, a body's model) as texts, by path."""
+    return {name: str(value) for name, value in storage.statics(sub).items()}
+
+
 def _blank(folder: Path, kind: str, facts: Any, sub: SubRMDP) -> ThreatModel:
-    """A model of the right structure, with the shapes of its weights."""
+    """Returns a model of the saved structure, with shapes in place of its weights."""
     hidden = facts.get("hidden") if isinstance(facts, dict) else None
     if (
         not isinstance(hidden, list)
@@ -119,9 +176,9 @@ def _blank(folder: Path, kind: str, facts: Any, sub: SubRMDP) -> ThreatModel:
             f"{folder}: {kind}: activation is {facts.get('activation')!r}; it must be one of "
             f"{sorted(ACTIVATIONS)}"
         )
-    network = ThreatNetwork(tuple(hidden), sub.agent.num_threats, facts["activation"])
+    network = ThreatNetwork(tuple(hidden), num_threats(sub.body), facts["activation"])
     features = jax.eval_shape(
-        lambda key: sub.source.features(*sub.source.sample(key, sub.agent)), jax.random.key(0)
+        lambda key: sub.source.features(*sub.source.sample(key, sub.body)), jax.random.key(0)
     )
     shapes = jax.eval_shape(network.init, jax.random.key(0), features)
     return ThreatModel(sub.source, shapes, features, jnp.zeros(()), network)

@@ -1,4 +1,4 @@
-"""Algorithm 2, lines 1 and 2: labels, fit and report of one sub-R-MDP's threat function."""
+"""Learns the threat function of one sub-R-MDP: labels, fit, calibration, report (Algorithm 2)."""
 
 import dataclasses
 import functools
@@ -22,31 +22,31 @@ from rp_jax.threat.fit import Dataset, FitConfig
 from rp_jax.threat.model import ThreatModel
 from rp_jax.validate import finite, leading, number, one_of, random_key
 
-Progress = Callable[[str, int, int], None]  # (stage, done, total)
+Progress = Callable[[str, int, int], None]  # called with (stage, done, total)
 SAMPLINGS = ("uniform", "preferential")
-CHUNKS = 20  # of a fit: points of its curve, and times for a checkpoint
+CHUNKS = 20  # parts of a fit; after each one there is a point of its curve, and a checkpoint
 
 
 @dataclass(frozen=True)
 class ThreatConfig:
-    """How the threat function of one kind of hazard is learned."""
+    """Settings for learning the threat function of one kind of hazard."""
 
-    states: int = 200_000  # labelled start states
-    paths: int = 64  # rollouts per state, where the label is not exact
-    exact: bool = True  # labels are, where all rollouts can be enumerated; False: nowhere
-    sampling: str = "uniform"  # of the start states: uniform or preferential
-    prudence: float = 1.0  # most states near x with an unsafe action called safe; 1: as fitted
-    confidence: float = 0.95  # of that
-    test_states: int = 2000  # fresh states that the report is made on
-    test_paths: int = 8192  # rollouts per fresh state, where the label is not exact
-    fit: FitConfig = field(default_factory=FitConfig)
+    states: int = 200_000  # number of labelled start states
+    paths: int = 64  # rollouts per state where the label is not exact
+    exact: bool = True  # label exactly where all rollouts can be enumerated
+    sampling: str = "preferential"  # how start states are drawn: preferential or uniform
+    miss_rate: float = 0.02  # greatest share of unsafe states taken for safe; 1: no calibration
+    confidence: float = 0.95  # confidence that `miss_rate` is kept
+    test_states: int = 2000  # number of fresh states for the report and the calibration
+    test_paths: int = 8192  # rollouts per fresh state where the label is not exact
+    fit: FitConfig = field(default_factory=FitConfig)  # settings of the fit
 
     def validate(self, name: str) -> None:
         """Raises ValueError, naming the field after `name`, if a value is out of range."""
         number(f"{name}.states", self.states, least=100, integer=True)
         number(f"{name}.paths", self.paths, least=2, integer=True)
         one_of(f"{name}.sampling", self.sampling, SAMPLINGS)
-        number(f"{name}.prudence", self.prudence, above=0, most=1)
+        number(f"{name}.miss_rate", self.miss_rate, above=0, most=1)
         number(f"{name}.confidence", self.confidence, above=0, most=0.999999)
         number(f"{name}.test_states", self.test_states, least=10, integer=True)
         number(f"{name}.test_paths", self.test_paths, least=2, integer=True)
@@ -56,15 +56,15 @@ class ThreatConfig:
 
 
 class Built(NamedTuple):
-    """A threat model and how it came about."""
+    """A threat model and how it was made."""
 
     model: ThreatModel
-    curve: list[dict[str, float]]  # step, loss, validation loss and error
-    report: dict[str, Any]  # on a fresh draw; see `report.compare`
-    seconds: dict[str, float]  # labels, fit, report
+    curve: list[dict[str, float]]  # rows of step, loss, validation loss and validation error
+    report: dict[str, Any]  # errors on freshly drawn states; see `report.compare`
+    seconds: dict[str, float]  # duration of labels, fit and report
 
 
-# Compiled whole: one by one, their operations would take a minute to compile.
+# Compiled as a whole: their operations one by one would take a minute to compile.
 _preferential = jax.jit(sampling.preferential, static_argnames="count")
 _split = jax.jit(fit.split, static_argnames="share")
 _init = jax.jit(fit.init, static_argnames="config")
@@ -73,18 +73,19 @@ _logits = jax.jit(ThreatModel.logits)
 
 
 def _labelled(key, features, sub, estimator, stage, on_progress, mesh, checkpoints) -> Dataset:
-    agent, hazard = sampling.states(sub, features)
+    """Returns the states with these features, labelled."""
+    body, hazard = sampling.states(sub, features)
     watch = (lambda done, total: on_progress(stage, done, total)) if on_progress else None
     at = checkpoints.at(stage)
     found = labels.label(
-        key, agent, hazard, sub, estimator, on_progress=watch, mesh=mesh, checkpoints=at
+        key, body, hazard, sub, estimator, on_progress=watch, mesh=mesh, checkpoints=at
     )
     return Dataset(features, found.threat)
 
 
 @jax.jit
 def _validated(model: ThreatModel, params: Any, held: Dataset) -> tuple[Array, Array]:
-    """Cross entropy and mean absolute error."""
+    """Returns cross entropy and mean absolute error on held-out states."""
     logits = model.replace(params=params).logits(held.features)
     error = jnp.mean(jnp.abs(jax.nn.sigmoid(logits) - held.threat))
     return fit.cross_entropy(logits, held.threat), error
@@ -98,13 +99,25 @@ def fitted(
     on_progress: Progress | None = None,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> tuple[ThreatModel, list[dict[str, float]]]:
-    """Fits a model to labelled states and their mirror images; returns it and its curve.
+    """Fits a model to labelled states and their mirror images.
 
-    The steps are those of the settings, or a few more, so that all CHUNKS chunks are alike.
+    The number of steps is that of the settings or slightly more, so that the fit divides into
+    `CHUNKS` equal parts.
+
+    Args:
+        key: random key for the initial weights and the order of the states.
+        sub: the sub-R-MDP.
+        data: labelled states.
+        config: settings of the fit.
+        on_progress: called with ("fit", steps done, steps).
+        checkpoints: where to save the state of the fit.
+
+    Returns:
+        The fitted model, and its curve: rows of step, loss, validation loss and validation error.
 
     Raises:
-        ValueError: a setting is out of range, or there are not as many labels as states.
-        FloatingPointError: the loss, or a weight after a step, is not a finite number.
+        ValueError: a setting is out of range, or features and threats differ in number.
+        FloatingPointError: a loss or a weight is not a finite number.
     """
     random_key("key", key)
     config.validate("config")
@@ -138,32 +151,38 @@ def fitted(
 
 
 class Calibration(NamedTuple):
-    """What is known of a calibrated model; of states drawn as those it was calibrated on."""
+    """A statement on a calibrated model, for states drawn like those it was calibrated on."""
 
-    rate: float  # at most this share of the states with an unsafe action have one called safe,
-    confidence: float  # with this confidence (over the draw of the states)
-    states: int  # drawn
-    unsafe_states: int  # with an action above x
-    missed: int  # those of which an unsafe action is still called safe
+    rate: float  # bound of the share, among states with an unsafe action, that have one called safe
+    confidence: float  # probability, over the draw of the states, with which the bound holds
+    states: int  # number of states drawn
+    unsafe_states: int  # how many of them have an action with a threat above x
+    missed: int  # how many of these still have such an action called safe
 
 
 def calibrated(
     model: ThreatModel, data: Dataset, x: float, rate: float, confidence: float
 ) -> tuple[ThreatModel, Calibration]:
-    """Shifts small logits up until few states have an unsafe action (label above x) called safe.
+    """Shifts small logits up until few states have an unsafe action called safe.
 
-    The least shift for which the exact upper bound of that share is at most `rate`: an order
-    statistic of the shift each state needs, as in split-conformal prediction. The bound holds for
-    independent states that the model has not been fitted to, whatever the model; never downwards.
-    Where there are too few unsafe states for the rate, none is let through, and `rate` is what
-    that shows. Logits above x are unsafe as they are, and move less the larger they are.
+    An action is unsafe if its label exceeds x, and called safe if the model's threat is at most x.
+    The shift is the least one for which the exact upper confidence bound of the share of such
+    states is at most `rate`: an order statistic of the shift that each state needs, as in
+    split-conformal prediction. The bound holds for any model, provided that the states are
+    independent of each other and of the fit. Where there are too few unsafe states to show the
+    rate, none is let through, and the result says which rate that shows. Logits are never shifted
+    down; those above x move less the greater they are, since they are called unsafe anyway.
 
     Args:
-        model: as fitted, not shifted yet.
-        data: labelled states, independent of one another and of the fit.
-        x: threshold, inside (0, 1): elsewhere no shift could change a decision.
-        rate: most states with an unsafe action called safe.
-        confidence: of the statement.
+        model: the model as fitted, not shifted yet.
+        data: labelled states, independent of each other and of the fit.
+        x: threshold; outside (0, 1) no shift could change a decision, and the model is returned as
+            it is.
+        rate: greatest share of the states with an unsafe action that may have one called safe.
+        confidence: level of the confidence bound.
+
+    Returns:
+        The shifted model, and the statement that holds for it.
     """
     unsafe = np.asarray(data.threat) > x
     counted = unsafe.any(axis=1)
@@ -182,9 +201,20 @@ def calibrated(
 
 
 def near_threshold(key: Array, sub: SubRMDP, model: ThreatModel, x: float, most: int) -> Array:
-    """(n <= most, F) features of states that matter, independent of one another.
+    """Draws features of states whose threats are near x, independent of each other.
 
-    Drawn uniformly and kept with the probability that `sampling.interest` says.
+    States are drawn uniformly, and each is kept with probability `sampling.interest` of the threats
+    that the model predicts.
+
+    Args:
+        key: random key.
+        sub: the sub-R-MDP.
+        model: predicts threats.
+        x: threshold.
+        most: greatest number of states to return.
+
+    Returns:
+        (n, F) features, n <= most.
     """
     pool, kept = _thinned(key, sub, model, x, 20 * most)
     return jnp.asarray(np.asarray(pool)[np.flatnonzero(kept)[:most]])
@@ -194,7 +224,7 @@ def near_threshold(key: Array, sub: SubRMDP, model: ThreatModel, x: float, most:
 def _thinned(
     key: Array, sub: SubRMDP, model: ThreatModel, x: float, count: int
 ) -> tuple[Array, Array]:
-    """(features, whether they are kept)."""
+    """Returns features drawn uniformly, and which of them are kept."""
     draw_key, keep_key = jax.random.split(key)
     pool = sampling.uniform(draw_key, sub, count)
     odds = jnp.minimum(sampling.interest(model(pool), x), 1.0)
@@ -213,14 +243,17 @@ def build(
     """Learns the threat function of one kind of hazard.
 
     Args:
-        key: of everything random in it.
+        key: random key for all steps.
         sub: the sub-R-MDP.
-        config: sizes.
-        x: the threshold at which the report counts wrong decisions, and preferential sampling
-            and prudence look closely.
-        on_progress: told how far each stage is.
-        mesh: of devices that share the rollouts; None for one device.
-        checkpoints: of its labels and fits.
+        config: settings.
+        x: threshold at which the report counts wrong decisions, and near which preferential
+            sampling and calibration look for states.
+        on_progress: called with (stage, done, total).
+        mesh: devices that share the rollouts; None for one device.
+        checkpoints: where to save labels and fits that are done.
+
+    Returns:
+        The model, its learning curve, a report on freshly drawn states, and durations.
 
     Raises:
         ValueError: a setting is out of range.
@@ -251,12 +284,12 @@ def build(
     labelled = time.perf_counter()
     model, curve = fitted(keys[5], sub, data, config.fit, on_progress, checkpoints=at("fit"))
     facts = {}
-    if config.prudence < 1:
+    if config.miss_rate < 1:
         hard = near_threshold(keys[8], sub, model, x, config.test_states)
         checked = _labelled(
             keys[6], hard, sub, accurate, "calibration", on_progress, mesh, checkpoints
         )
-        rate, confidence = config.prudence, config.confidence
+        rate, confidence = config.miss_rate, config.confidence
         model, known = calibrated(model, checked, x, rate, confidence)
         facts = {"calibration": known._asdict()}
     fitted_at = time.perf_counter()

@@ -16,22 +16,22 @@ from rp_jax.validate import number, one_of, shown
 class Dataset(NamedTuple):
     """Labelled states of one sub-R-MDP."""
 
-    features: Array  # (n, F)
-    threat: Array  # (n, A)
+    features: Array  # (n, F) features of the states
+    threat: Array  # (n, A) their threats, the labels
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How a threat model is fitted."""
+    """Settings for fitting a threat model."""
 
-    hidden: tuple[int, ...] = (128, 64)
-    activation: str = "silu"
-    steps: int = 10_000
-    batch: int = 1024
-    learning_rate: float = 3e-3
-    epsilon: float = 1e-8  # Adam's
-    cosine: bool = True  # else a constant rate
-    validation: float = 0.05  # share of the states held out
+    hidden: tuple[int, ...] = (128, 128, 128)  # widths of the network's hidden layers
+    activation: str = "silu"  # relu or silu
+    steps: int = 12_000  # number of gradient steps
+    batch: int = 1024  # states per gradient step
+    learning_rate: float = 3e-3  # Adam's learning rate
+    epsilon: float = 1e-8  # Adam's epsilon
+    cosine: bool = True  # let the rate fall to 0 along a cosine; otherwise it is constant
+    validation: float = 0.05  # share of the states held out for validation
 
     def validate(self, name: str) -> None:
         """Raises ValueError, naming the field after `name`, if a value is out of range."""
@@ -49,16 +49,23 @@ class FitConfig:
 
 
 class FitState(NamedTuple):
-    """Carried through the fit."""
+    """The state of a fit between two steps."""
 
-    params: Any
-    opt_state: optax.OptState
-    key: Array
+    params: Any  # weights of the network
+    opt_state: optax.OptState  # state of the optimiser
+    key: Array  # random key of the next step
 
 
 def mirror(data: Dataset, sub: SubRMDP) -> Dataset:
-    """Adds the left-right mirror image of every row: the sub-R-MDP is symmetric."""
-    swapped = data.threat[:, sub.agent.mirrored_threats()]
+    """Adds the left-right mirror image of every row, where the sub-R-MDP has that symmetry.
+
+    Args:
+        data: labelled states.
+        sub: the sub-R-MDP; without the symmetry the data is returned unchanged.
+    """
+    if not (hasattr(sub.body, "mirrored_threats") and hasattr(sub.source, "mirrored")):
+        return data
+    swapped = data.threat[:, sub.body.mirrored_threats()]
     return Dataset(
         features=jnp.concatenate([data.features, sub.source.mirrored(data.features)]),
         threat=jnp.concatenate([data.threat, swapped]),
@@ -66,7 +73,16 @@ def mirror(data: Dataset, sub: SubRMDP) -> Dataset:
 
 
 def split(key: Array, data: Dataset, share: float) -> tuple[Dataset, Dataset]:
-    """(training, validation) rows, drawn at random."""
+    """Splits rows at random into a training and a validation set.
+
+    Args:
+        key: random key.
+        data: labelled states.
+        share: fraction of the rows in the validation set.
+
+    Returns:
+        (training set, validation set).
+    """
     n = len(data.features)
     held = round(n * share)
     order = jax.random.permutation(key, n)
@@ -75,12 +91,27 @@ def split(key: Array, data: Dataset, share: float) -> tuple[Dataset, Dataset]:
 
 
 def cross_entropy(logits: Array, threat: Array) -> Array:
-    """Mean cross entropy; unbiased under noisy labels, least at their expectation."""
+    """Returns the mean cross entropy of predictions.
+
+    It is unbiased under noise of the labels, and least where the predictions are their
+    expectations.
+
+    Args:
+        logits: (..., A) predicted logits.
+        threat: (..., A) labels in [0, 1].
+
+    Returns:
+        () mean over all elements.
+    """
     return jnp.mean(optax.sigmoid_binary_cross_entropy(logits, threat))
 
 
 def optimiser(config: FitConfig) -> optax.GradientTransformation:
-    """Adam, with the rate falling to zero along a cosine unless told otherwise."""
+    """Returns Adam with the learning rate of the settings.
+
+    Args:
+        config: settings; with `cosine` the rate falls to 0 along a cosine.
+    """
     rate = config.learning_rate
     schedule = optax.cosine_decay_schedule(rate, config.steps) if config.cosine else rate
     return optax.adam(schedule, eps=config.epsilon)
@@ -89,7 +120,16 @@ def optimiser(config: FitConfig) -> optax.GradientTransformation:
 def init(
     key: Array, sub: SubRMDP, data: Dataset, config: FitConfig
 ) -> tuple[ThreatModel, FitState]:
-    """A fresh model whose inputs are scaled by the spread of the data, and its fit's state."""
+    """Returns a new model and the state of its fit.
+
+    The model's inputs are scaled by the spread of the data.
+
+    Args:
+        key: random key for the weights and the fit.
+        sub: the sub-R-MDP.
+        data: labelled states; only their shape and spread matter.
+        config: settings of the fit.
+    """
     network = ThreatNetwork(config.hidden, data.threat.shape[-1], config.activation)
     begin, onward = jax.random.split(key)
     params = network.init(begin, data.features[:1])
@@ -101,7 +141,18 @@ def init(
 def run(
     model: ThreatModel, state: FitState, data: Dataset, config: FitConfig, steps: int
 ) -> tuple[FitState, Array]:
-    """`steps` gradient steps in one scan. Returns the state and the loss of each step."""
+    """Makes gradient steps, all in one scan.
+
+    Args:
+        model: the model; its weights are those of `state`.
+        state: the state of the fit.
+        data: labelled states to draw batches from.
+        config: settings of the fit.
+        steps: number of steps.
+
+    Returns:
+        The state after the steps, and the loss (steps,) of each step.
+    """
     transform = optimiser(config)
 
     def loss(params, features, threat):

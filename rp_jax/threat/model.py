@@ -10,19 +10,26 @@ from flax import struct
 from jax import Array
 
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"relu": nn.relu, "silu": nn.silu}
-DEEPEST, WIDEST = 16, 4096  # layers of a network, and units of a layer, at most
+DEEPEST, WIDEST = 16, 4096  # greatest number of layers, and of units in a layer
 
 
 class ThreatNetwork(nn.Module):
-    """A perceptron from features to the logit of each action's threat."""
+    """A perceptron that maps features to the logit of each action's threat."""
 
-    hidden: tuple[int, ...]  # widths; the paper: 100-50 for walls, 500-500-500 for obstacles
-    num_actions: int
-    activation: str = "relu"
+    hidden: tuple[int, ...]  # widths; in the paper 100-50 for walls, 500-500-500 for obstacles
+    num_actions: int  # number of threats: one for each action, or for each plan and action
+    activation: str = "relu"  # a name in `ACTIVATIONS`
 
     @nn.compact
     def __call__(self, features: Array) -> Array:
-        """(..., F) -> (..., A) logits."""
+        """Returns the logits of the threats.
+
+        Args:
+            features: (..., F).
+
+        Returns:
+            (..., A).
+        """
         x = features
         for width in self.hidden:
             x = ACTIVATIONS[self.activation](nn.Dense(width)(x))
@@ -30,30 +37,47 @@ class ThreatNetwork(nn.Module):
 
 
 class ThreatModel(struct.PyTreeNode):
-    """A network with its weights, and the hazards it speaks of."""
+    """A network with its weights, and the kind of hazard whose threats it predicts."""
 
-    source: Any  # a HazardSource: features and window
+    source: Any  # the kind of hazard, a `HazardSource`; says what the features are
     params: Any  # weights of `network`
-    scale: Array  # (F,) features are multiplied by this before the network
+    scale: Array  # (F,) factors of the features before they enter the network
     shift: Array  # () added to logits up to `knee`; above 0 to err on the safe side
     network: ThreatNetwork = struct.field(pytree_node=False)
-    knee: Array = struct.field(default_factory=lambda: jnp.asarray(jnp.inf))  # () logit; far
-    # above it, threats are as fitted
+    knee: Array = struct.field(default_factory=lambda: jnp.asarray(jnp.inf))  # () logit above
+    # which the shift fades
 
     def logits(self, features: Array) -> Array:
-        """(..., F) -> (..., A)."""
+        """Returns the logits of the threats, shifted.
+
+        Args:
+            features: (..., F).
+
+        Returns:
+            (..., A).
+        """
         scale = jnp.broadcast_to(self.scale, features.shape)
         return self.shifted(jnp.asarray(self.network.apply(self.params, features * scale)))
 
     def shifted(self, fitted: Array) -> Array:
-        """Logits of any shape, as fitted, moved up: by `shift` up to `knee`, then ever less.
+        """Moves logits up: by `shift` up to `knee`, and by less the further they are above it.
 
-        The order of threats stays; from `knee` + 2 `shift` on they are as fitted, since the
-        fallback compares large ones.
+        The order of the threats stays the same. From `knee` + 2 `shift` on, logits are not moved,
+        since the choice among inadmissible actions compares large threats.
+
+        Args:
+            fitted: logits as fitted, of any shape.
         """
         fading = jnp.maximum(fitted, 0.5 * (fitted + self.knee) + self.shift)
         return jnp.where(fitted <= self.knee, fitted + self.shift, fading)
 
     def __call__(self, features: Array) -> Array:
-        """(..., F) -> (..., A) threats in [0, 1]."""
+        """Returns the threats, in [0, 1].
+
+        Args:
+            features: (..., F).
+
+        Returns:
+            (..., A).
+        """
         return jax.nn.sigmoid(self.logits(features))

@@ -1,4 +1,4 @@
-"""How good a threat model is, where it matters: single hazards, and the sum over them."""
+"""How good a threat model is where it matters: for single hazards, and for the sum over them."""
 
 from typing import Any
 
@@ -10,21 +10,30 @@ from scipy import stats
 
 from rp_jax import statistics
 from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
-from rp_jax.envs.base import Hazards
+from rp_jax.dynamics import num_threats
+from rp_jax.envs.contract import Hazards
 from rp_jax.recon import labels
 from rp_jax.threat.model import ThreatModel
 from rp_jax.threat.total import counted
 
 
 def compare(predicted: np.ndarray, true: np.ndarray, x: float) -> dict[str, float]:
-    """Errors of predicted against true threats (n, A) of n states, and decisions at x.
+    """Compares predicted threats with true ones, and the decisions that follow at a threshold.
+
+    An action is unsafe if its true threat exceeds x, and called safe if its predicted one does not.
+
+    Args:
+        predicted: (n, A) threats of n states.
+        true: (n, A) threats of the same states.
+        x: threshold.
 
     Returns:
-        mae, rmse, bias (predicted less true), spearman (nan if either is constant);
-        unsafe_called_safe: of the pairs truly above x, the share predicted at most x;
-        safe_called_unsafe: of the pairs truly at most x, the share predicted above; and the number
-        of pairs of either kind. unsafe_states: those with an unsafe action; states_missed: of
-        these, those with one called safe, and the one-sided exact 95 % bound of their share.
+        A table with the errors `mae`, `rmse` and `bias` (predicted less true); `spearman`, the rank
+        correlation (nan if either side is constant); `unsafe` and `safe`, the numbers of unsafe and
+        safe actions; `unsafe_called_safe`, the share of the unsafe ones that are called safe;
+        `safe_called_unsafe`, the share of the safe ones that are called unsafe; `unsafe_states`,
+        the number of states with an unsafe action; `states_missed`, how many of these have one
+        called safe; and `states_missed_upper95`, the one-sided exact 95 % bound of their share.
     """
     missed = (true > x) & (np.asarray(predicted) <= x)
     states, of = int(missed.any(axis=-1).sum()), int((true > x).any(axis=-1).sum())
@@ -49,35 +58,46 @@ def compare(predicted: np.ndarray, true: np.ndarray, x: float) -> dict[str, floa
 
 @jax.jit
 def predict(model: ThreatModel, features: Array) -> Array:
-    """(n, A) threats of features (n, F); 0 for what is out of reach, as `total_threat` has it."""
+    """Returns a model's threats, 0 where the hazard is out of reach, as in `total_threat`.
+
+    Args:
+        model: the model.
+        features: (n, F).
+
+    Returns:
+        (n, A).
+    """
     reached = jax.vmap(lambda row: model.source.in_reach(*model.source.state_of(row)))(features)
     return jnp.where(reached[:, None], model(features), 0.0)
 
 
 def labelled_sum(
     key: Array,
-    agents: Any,
+    bodies: Any,
     hazards: Hazards,
     sub: Any,
     estimator: labels.Estimator,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> np.ndarray:
-    """(B, A) sum over hazards of their estimated threats: what a model's sum should be.
+    """Returns the sum over hazards of their estimated threats, which a model's sum should equal.
 
     Args:
-        key: of the estimator.
-        agents: leading axis (B,).
-        hazards: of one kind, leading axes (B, n).
-        sub: their sub-R-MDP.
-        estimator: labels a single (agent, hazard).
-        checkpoints: of the labels.
+        key: random key for the estimator.
+        bodies: states of the body, leading axis (B,).
+        hazards: hazards of one kind, leading axes (B, n).
+        sub: the kind's sub-R-MDP.
+        estimator: estimates the threats of one body and one hazard.
+        checkpoints: where to save the labels that are done.
+
+    Returns:
+        (B, A).
     """
-    reached = np.asarray(jax.jit(counted)(sub.source, agents, hazards))
+    reached = np.asarray(jax.jit(counted)(sub.source, bodies, hazards))
     row, column = np.nonzero(reached)
-    total = np.zeros((reached.shape[0], sub.agent.num_threats))
+    total = np.zeros((reached.shape[0], num_threats(sub.body)))
     if len(row):
-        agent = jax.tree.map(lambda a: a[row], agents)
+        body = jax.tree.map(lambda a: a[row], bodies)
         hazard = jax.tree.map(lambda a: a[row, column], hazards.state)
-        found = labels.label(key, agent, hazard, sub, estimator, checkpoints=checkpoints)
+        found = labels.label(key, body, hazard, sub, estimator, checkpoints=checkpoints)
         np.add.at(total, row, np.asarray(found.threat, float))
     return total

@@ -1,7 +1,7 @@
-"""The joint threat of all fixed hazards: no sum over them, and no model.
+"""The joint threat of all fixed hazards, exact and without a model.
 
-Plans are deterministic, and fixed hazards stay where they are: whether a plan meets any of them
-on its way to a halt is known exactly, and for ever. So it is 0 or certain.
+Plans are deterministic, and fixed hazards do not move: whether a plan hits one of them before it
+comes to rest is known exactly. So the threat is either 0 or certain, and need not be summed.
 """
 
 from collections.abc import Callable
@@ -10,18 +10,24 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rp_jax.kinematics import AgentModel, Plans, Vehicle
+from rp_jax.dynamics import Plans, Vehicle, VehicleModel
 
-MARGIN = 1e-4  # room units by which a way must be clear; rounding moves it by less in an episode
+MARGIN = 1e-4  # room units by which a path must be clear; rounding errors in an episode are less
 
 
-def plan_clearance(agent: Vehicle, model: AgentModel, clearance: Callable[[Array], Array]) -> Array:
-    """(K, A) least clearance on the way of each plan after each first action.
+def plan_clearance(
+    body: Vehicle, model: VehicleModel, clearance: Callable[[Array], Array]
+) -> Array:
+    """Returns the least clearance along the path of each plan after each first action.
 
     Args:
-        agent: unbatched.
-        model: its baseline is K plans.
-        clearance: from a position (2,) to the room left there, () room units.
+        body: the body's state, unbatched.
+        model: the body's model; its baseline policies must be K plans.
+        clearance: maps a position (2,) to the distance left there to the nearest fixed hazard, ()
+            room units.
+
+    Returns:
+        (K, A) room units.
     """
     plans = model.baseline
     assert isinstance(plans, Plans)
@@ -32,7 +38,7 @@ def plan_clearance(agent: Vehicle, model: AgentModel, clearance: Callable[[Array
             us = model.step(us, plan.control(k, us.speed))
             return (us, jnp.minimum(least, clearance(us.position))), None
 
-        first = model.step(agent, action)
+        first = model.step(body, action)
         begin = (first, clearance(first.position))
         # A loop: unrolled, it takes twice as long to run and to compile.
         return jax.lax.scan(onward, begin, jnp.arange(plans.horizon - 1))[0][1]
@@ -41,16 +47,26 @@ def plan_clearance(agent: Vehicle, model: AgentModel, clearance: Callable[[Array
 
 
 def static_threat(clearance: Array) -> Array:
-    """Threats (...) of ways with these clearances: 0, or from 2 to 3.
+    """Returns the threats of paths with given clearances: 0, or from 2 to 3.
 
-    Any value from 1 on bounds the probability of a certain hit. These are graded, so that where no
-    plan is clear by the margin, the clearest is the least threatening; and greater than any threat
-    of the moving hazards.
+    Every value from 1 on is an upper bound of the probability of a hit. The values are graded, so
+    that where no plan is clear the one with the greatest clearance is the least threatening; and
+    they are greater than the threat of moving hazards (see `bounded`).
+
+    Args:
+        clearance: (...) room units.
+
+    Returns:
+        (...).
     """
     short = jnp.clip((MARGIN - clearance) / (MARGIN + 1.0), 0.0, 1.0)
     return jnp.where(clearance >= MARGIN, 0.0, 2.0 + short)
 
 
 def bounded(total: Array) -> Array:
-    """Sums of threats (...) as they are up to 1; greater ones brought into (1, 1.5), in order."""
+    """Leaves threats up to 1 unchanged, and maps greater ones into (1, 1.5) in the same order.
+
+    Args:
+        total: (...) sums of threats.
+    """
     return jnp.where(total <= 1, total, 1.5 - 0.5 / jnp.maximum(total, 1.0))

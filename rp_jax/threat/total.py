@@ -7,28 +7,29 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rp_jax.envs.base import Hazards, packed
+from rp_jax.arrays import compact_indices
+from rp_jax.envs.contract import Hazards
 from rp_jax.threat.model import ThreatModel
 
-CHUNK = 256  # rows per call of a network; fixed, so that no result depends on the batch
+CHUNK = 256  # rows in a call of a network; fixed, so that results do not depend on the batch
 
 
 def total_threat(
-    models: Mapping[str, ThreatModel], agents: Any, hazards: Mapping[str, Hazards]
+    models: Mapping[str, ThreatModel], bodies: Any, hazards: Mapping[str, Hazards]
 ) -> Array:
-    """sum_n T_n(s, .) over all hazards in reach, for a batch of states (Theorem 3).
+    """Returns sum_n T_n(s, .) over all hazards in reach, for a batch of states (Theorem 3).
 
-    The theorem bounds rollouts that are not cut: the models' horizon leaves out what happens after
-    it, up to beta^horizon per unit of danger.
+    The theorem holds for rollouts that are not cut. The models' rollouts end at their horizon, and
+    leave out what happens later, up to beta^horizon for each unit of danger.
 
     Args:
-        models: by kind of hazard.
-        agents: agent states, leading axis (B,).
-        hazards: by kind, states with leading axes (B, n) and which of them are present (B, n).
+        models: the models by kind of hazard.
+        bodies: states of the body, leading axis (B,).
+        hazards: by kind, the hazards of each state, with leading axes (B, n).
 
     Returns:
-        (B, A). The sum is rounded up by the error of adding in floating point, so that nothing
-        is admitted for rounding's sake.
+        (B, A). The sum is rounded up by the error of floating-point addition, so that no action is
+        admitted because of rounding.
 
     Raises:
         ValueError: a kind of hazard has no model.
@@ -39,31 +40,39 @@ def total_threat(
             f"models: no threat model for {', '.join(missing)}; there are models for "
             f"{', '.join(sorted(models))}"
         )
-    parts = [_summed(models[kind], agents, hazards[kind]) for kind in sorted(hazards)]
+    parts = [_summed(models[kind], bodies, hazards[kind]) for kind in sorted(hazards)]
     total = jnp.sum(jnp.stack(parts), axis=0)
     terms = sum(group.present.shape[1] for group in hazards.values())
     return total * (1 + (terms + 1) * float(jnp.finfo(total.dtype).eps))
 
 
-def counted(source: Any, agents: Any, hazards: Hazards) -> Array:
-    """(B, n) bool, the hazards of one kind that are present and in reach of agents (B, ...)."""
-    reached = jax.vmap(jax.vmap(source.in_reach, (None, 0)))(agents, hazards.state)
+def counted(source: Any, bodies: Any, hazards: Hazards) -> Array:
+    """Returns which hazards of one kind count: those that are present and in reach.
+
+    Args:
+        source: the kind of hazard.
+        bodies: states of the body, leading axis (B,).
+        hazards: the hazards, leading axes (B, n).
+
+    Returns:
+        (B, n) bool.
+    """
+    reached = jax.vmap(jax.vmap(source.in_reach, (None, 0)))(bodies, hazards.state)
     return reached & hazards.present
 
 
-def _summed(model: ThreatModel, agents: Any, hazards: Hazards) -> Array:
-    """(B, A) of one kind. Only hazards in reach are shown to the network.
+def _summed(model: ThreatModel, bodies: Any, hazards: Hazards) -> Array:
+    """Returns the sum (B, A) over the hazards of one kind.
 
-    They are packed tightly first: few of the candidates are in reach, and how many varies much
-    from state to state.
+    Only those in reach go through the network: they are few, and are moved to the front first.
     """
     over_hazards = jax.vmap(model.source.features, (None, 0))
-    features = jax.vmap(over_hazards)(agents, hazards.state)  # (B, n, F)
-    inside = counted(model.source, agents, hazards)
+    features = jax.vmap(over_hazards)(bodies, hazards.state)  # (B, n, F)
+    inside = counted(model.source, bodies, hazards)
     batch, n = inside.shape
     if n == 0:
         return jnp.zeros((batch, model.network.num_actions), features.dtype)
-    order, count = packed(inside.reshape(-1), CHUNK, 0)
+    order, count = compact_indices(inside.reshape(-1), CHUNK, 0)
     rows = features.reshape(batch * n, -1)
 
     def add_chunk(carry):

@@ -11,7 +11,7 @@ from quick import compile_soon  # noqa: F401
 
 from rp_jax.adapters import gymnasium as adapter
 from rp_jax.adapters import registry
-from rp_jax.envs import base
+from rp_jax.envs import autoreset
 
 SPECIAL = {"jam": {"num_obstacles": 3}}
 SETTINGS = {name: {"time_limit": 12, **SPECIAL.get(name, {})} for name in registry.ENVS}
@@ -83,7 +83,7 @@ def stepper(name):
     @jax.jit
     def advance(key, states, action):
         keys = jax.random.split(jax.random.split(key)[1], ROWS)
-        carried, reached, outcome = base.auto_reset_step(task, keys, states, action, params)
+        carried, reached, outcome = autoreset.auto_reset_step(task, keys, states, action, params)
         look = jax.vmap(task.observe, (0, None))
         return carried, look(carried, params), look(reached, params), outcome
 
@@ -287,12 +287,12 @@ def test_a_shield_takes_the_nearest_admissible_row_of_a_continuous_action():
 
 
 def test_ours_can_be_shielded_too():
-    threat = lambda state: jnp.where(jnp.arange(15) < 10, 0.0, state.agent.speed + 1.0)  # noqa: E731
+    threat = lambda state: jnp.where(jnp.arange(15) < 10, 0.0, state.body.speed + 1.0)  # noqa: E731
     env = adapter.Shielded(make("jam"), threat, 0.5, state=lambda env: env.state)
     env.reset(seed=0)
     for _ in range(5):
         assert env.step(14)[-1]["intervention"]
-    assert env.unwrapped.state.agent.speed < 0  # it backs off, and was told to speed up
+    assert env.unwrapped.state.body.speed < 0  # it backs off, and was told to speed up
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import probe
 import pytest
 from quick import compile_soon  # noqa: F401
 
-from rp_jax import evaluate
+from rp_jax import evaluation
 from rp_jax.baselines import actor_critic
 from rp_jax.baselines.actor_critic import ActorCriticConfig, Batch
 from rp_jax.envs import jam
@@ -193,7 +193,7 @@ def test_a_driver_draws_or_takes_the_mode():
     @functools.partial(jax.jit, static_argnums=2)
     def play(weights, pmdp, greedy):
         policy = actor_critic.driver(network, weights, greedy=greedy)
-        return evaluate.play_episodes(jax.random.key(3), pmdp, policy, 2000, batch=1000)
+        return evaluation.play_episodes(jax.random.key(3), pmdp, policy, 2000, batch=1000)
 
     assert (play(weights, pmdp, True).score == 1).all()
     scores = np.asarray(play(weights, pmdp, False).score)

@@ -18,7 +18,7 @@ from rp_jax.baselines.actor_critic import DANGER, REWARD, Batch
 from rp_jax.baselines.cpo import CONSTRAINED, RECOVERY, UNCONSTRAINED, CPOConfig
 from rp_jax.baselines.policies import ACTORS
 from rp_jax.envs import jam
-from rp_jax.planning.pmdp import Encoded
+from rp_jax.planning.percept import Encoded
 from rp_jax.tabular import oracle, threat
 
 CONFIG = CPOConfig(rollout=ROLLOUT)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from quick import compile_soon  # noqa: F401
 
-from rp_jax import evaluate
+from rp_jax import evaluation
 from rp_jax.baselines import mpc
+from rp_jax.dynamics import angle_of, make_vehicle
 from rp_jax.envs import circuit, jam
-from rp_jax.kinematics import angle_of, make_vehicle
 
 ENVS = {"circuit": circuit, "jam": jam}
 PENALTY = {"circuit": 200.0, "jam": 50.0}
@@ -42,10 +42,10 @@ def rows_of(*states):
 
 def crowded(**settings):
     """An agent at full speed in the middle of the room, obstacles within a few steps of it."""
-    agent = make_vehicle((1.5, 1.5), 0.7, 0.1)
+    body = make_vehicle((1.5, 1.5), 0.7, 0.1)
     spots, headings = [(1.78, 1.62), (1.6, 1.9), (2.6, 2.0)], [2.9, -2.2, 0.3]
     others = make_vehicle(spots, headings, [0.06, 0.04, 0.02])
-    return jam.start_at(agent, others, params_of("jam", num_obstacles=3, **settings))
+    return jam.start_at(body, others, params_of("jam", num_obstacles=3, **settings))
 
 
 @functools.cache
@@ -67,7 +67,7 @@ def driven(env, count, steps, **settings):
     return jax.tree.map(lambda a: a[kept], states)
 
 
-def expected_hits(agents, state, params):
+def expected_hits(bodies, state, params):
     """Danger of a path of the agent, one obstacle at a time, by listing all that each may do.
 
     `agents` are its positions (x + iy) after each step, up to the end of the path.
@@ -76,17 +76,17 @@ def expected_hits(agents, state, params):
     turn = lambda v: np.asarray(v, float)[..., 0] + 1j * np.asarray(v, float)[..., 1]  # noqa: E731
     chance, spin = np.asarray(behaviour.probabilities, float), turn(behaviour.controls.rotation)
     push = np.asarray(behaviour.controls.acceleration, float)
-    every = np.asarray(list(itertools.product(range(len(chance)), repeat=len(agents))))
+    every = np.asarray(list(itertools.product(range(len(chance)), repeat=len(bodies))))
     total = 0.0
     for n in np.flatnonzero(state.present):
         place = np.full(len(every), turn(state.obstacles.position[n]))
         way = np.full(len(every), turn(state.obstacles.heading[n]))
         speed = np.full(len(every), float(state.obstacles.speed[n]))
         hit = np.zeros(len(every), bool)
-        for k, agent in enumerate(agents):
+        for k, body in enumerate(bodies):
             place = place + way * speed
             way, speed = way * spin[every[:, k]], np.clip(speed + push[every[:, k]], 0, 0.06)
-            hit |= abs(place - agent) < 2 * float(params.radius)
+            hit |= abs(place - body) < 2 * float(params.radius)
         total += (chance[every].prod(axis=1) * hit).sum()
     return total
 
@@ -97,11 +97,11 @@ def looped(env, state, search):
     hits = functools.cache(lambda path: expected_hits(path, state, search.params))
     scores = np.full(15, -np.inf)
     for sequence in itertools.product(range(15), repeat=search.horizon):
-        at, reward, danger, path = ENVS[env].alone(state), 0.0, 0.0, []
+        at, reward, danger, path = ENVS[env].without_moving_hazards(state), 0.0, 0.0, []
         for action in sequence:
             at, outcome = step(jax.random.key(9), at, action, search.params)
             reward, danger = reward + float(outcome.reward), danger + float(outcome.danger)
-            path.append(complex(*np.asarray(at.agent.position, float)))
+            path.append(complex(*np.asarray(at.body.position, float)))
             if outcome.done:
                 break
         if env == "jam":
@@ -117,7 +117,7 @@ def test_danger_is_the_expectation_over_all_that_each_obstacle_may_do(sequence):
     node, path = root(state, search), []
     for action in sequence:
         node = follow(node, action, search)
-        path.append(complex(*np.asarray(node.state.agent.position, float)))
+        path.append(complex(*np.asarray(node.state.body.position, float)))
     expected = expected_hits(path, state, search.params)
     assert 0.01 < expected < 3
     np.testing.assert_allclose(node.danger, expected, atol=1e-5)
@@ -134,7 +134,7 @@ def test_absent_obstacles_are_no_danger():
 
 def test_scores_are_those_of_a_loop_over_all_sequences_on_jam():
     search, state = search_of("jam", 2, num_obstacles=3), crowded()
-    near_goal = state.replace(agent=make_vehicle((2.6, 2.85), 1.5, 0.1), progress=jnp.asarray(-3.0))
+    near_goal = state.replace(body=make_vehicle((2.6, 2.85), 1.5, 0.1), progress=jnp.asarray(-3.0))
     for start in (state, near_goal):
         expected = looped("jam", start, search)
         np.testing.assert_allclose(exhaustive(rows_of(start), search)[0], expected, atol=1e-3)
@@ -155,7 +155,7 @@ def test_before_a_wall_it_turns_away_or_brakes():
     left, right, along = np.asarray(
         pruned(rows_of(facing(0.75), facing(-0.75), facing(0.0)), search)
     )
-    turn = np.asarray(angle_of(search.params.agent.actions.rotation))
+    turn = np.asarray(angle_of(search.params.body.actions.rotation))
     assert turn[left.argmax()] < 0 < turn[right.argmax()]
     assert along.max() == 20  # 4 steps at full speed, a centre point every .02
     assert left.max() > 0  # no crash
@@ -163,10 +163,10 @@ def test_before_a_wall_it_turns_away_or_brakes():
 
 def test_an_obstacle_in_the_way_is_avoided():
     search = search_of("jam", 3, num_obstacles=1)
-    agent = make_vehicle((1.0, 1.0), np.pi / 4, 0.1)
+    body = make_vehicle((1.0, 1.0), np.pi / 4, 0.1)
     ahead = make_vehicle([(1.3, 1.3)], [np.pi / 4], [0.0])
     behind = make_vehicle([(0.5, 0.5)], [np.pi / 4], [0.0])
-    blocked, free = (jam.start_at(agent, other, search.params) for other in (ahead, behind))
+    blocked, free = (jam.start_at(body, other, search.params) for other in (ahead, behind))
     straight = 12
     scores = np.asarray(exhaustive(rows_of(blocked, free), search))
     best = scores.argmax(axis=-1)
@@ -176,7 +176,7 @@ def test_an_obstacle_in_the_way_is_avoided():
     assert node.danger == 1
     assert scores[1, straight] == scores[1].max()
     assert scores[0].max() > -20  # a way around, or a halt
-    assert search.params.agent.actions.acceleration[best[0]] <= 0 or best[0] != straight
+    assert search.params.body.actions.acceleration[best[0]] <= 0 or best[0] != straight
 
 
 CASES = {
@@ -272,7 +272,7 @@ def test_parameters_and_penalties_need_no_new_program():
 def test_it_is_evaluated_as_any_policy():
     search = search_of("jam", 2, num_obstacles=3, time_limit=6)
     run = jax.jit(
-        lambda key, pmdp: evaluate.run_episodes(key, pmdp, mpc.values(search), 8, batch=4)
+        lambda key, pmdp: evaluation.run_episodes(key, pmdp, mpc.values(search), 8, batch=4)
     )
     rows = run(jax.random.key(0), mpc.omniscient(search))
     assert rows.length.shape == (8,)
@@ -302,13 +302,13 @@ def test_alone_nothing_is_random(env):
     @jax.jit
     @jax.vmap
     def both(state):
-        lone = ENVS[env].alone(state)
+        lone = ENVS[env].without_moving_hazards(state)
         keys = jax.random.key(0), jax.random.key(7)
         return [ENVS[env].step(key, lone, 14, params) for key in keys]
 
     (one, first), (other, second) = jax.device_get(both(states))
     for a, b in zip(
-        jax.tree.leaves((one.agent, first)), jax.tree.leaves((other.agent, second)), strict=True
+        jax.tree.leaves((one.body, first)), jax.tree.leaves((other.body, second)), strict=True
     ):
         np.testing.assert_array_equal(a, b)
 

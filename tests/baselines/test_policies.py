@@ -6,7 +6,7 @@ from quick import compile_soon  # noqa: F401
 from scipy import stats
 
 from rp_jax.baselines.policies import ACTORS, LOG_STD, Categorical, Critic, Gaussian
-from rp_jax.planning.pmdp import Encoded
+from rp_jax.planning.percept import Encoded
 
 SCALE = (1.0, 0.5, 10.0)
 RNG = np.random.default_rng(0)

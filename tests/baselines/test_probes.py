@@ -11,7 +11,7 @@ import probe
 import pytest
 from learning import ROLLOUT, danger_and_return
 
-from rp_jax import evaluate
+from rp_jax import evaluation
 from rp_jax.baselines import actor_critic, cpo, pid_lagrangian
 from rp_jax.baselines.cpo import CPOConfig
 from rp_jax.baselines.pid_lagrangian import PIDConfig
@@ -75,9 +75,9 @@ def test_continuous_actions_reach_the_coin_or_the_bait(name, limit):
     @jax.jit
     def play(actor, pmdp):
         policy = actor_critic.driver(network, actor)
-        return evaluate.play_episodes(jax.random.key(2), pmdp, policy, 500, batch=500)
+        return evaluation.play_episodes(jax.random.key(2), pmdp, policy, 500, batch=500)
 
-    found = evaluate.summarise(play(actor, pmdp), 0.0)
+    found = evaluation.summarise(play(actor, pmdp), 0.0)
     if limit == 1.0:
         assert found["crash_rate"] > 0.9
     else:

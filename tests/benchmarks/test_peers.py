@@ -10,8 +10,8 @@ from quick import compile_soon  # noqa: F401 (a fixture for all of this file)
 from benchmarks.measure import Row
 from benchmarks.peers import __main__ as peers
 from benchmarks.peers import environments, numpy_jam, rejax_dqn
+from rp_jax.dynamics import Control, angle_of, make_vehicle
 from rp_jax.envs import jam
-from rp_jax.kinematics import Control, angle_of, make_vehicle
 
 ROW = Row("theirs", "agent steps", 1, 2.0, 1.0, 4.0, 0.0, 100.0)
 
@@ -44,14 +44,14 @@ def test_the_numpy_step_is_ours_transition_for_transition():
     transition, observe = jax.jit(jam.transition), jax.jit(jam.observe)
     seen = {"crashed": 0, "goal": 0, "gone": 0, "safe": 0}
     for trial in range(100):
-        agent = vehicles(rng, jam.SPEEDS)
+        body = vehicles(rng, jam.SPEEDS)
         if trial % 4 == 0:
-            agent[:2] = 2.6 + rng.uniform(-0.2, 0.2), 2.95
+            body[:2] = 2.6 + rng.uniform(-0.2, 0.2), 2.95
         others = vehicles(rng, jam.OBSTACLE_SPEEDS, 8)
         drive = np.stack([rng.choice(v, 8) for v in (jam.ACCELERATIONS, jam.OBSTACLE_TURNS)], -1)
         relocated, action = vehicles(rng, jam.OBSTACLE_SPEEDS, 8), int(rng.integers(15))
-        state = numpy_jam.State(agent, others, numpy_jam._progress(agent), int(rng.integers(100)))
-        mine = jam.start_at(as_vehicle(agent), as_vehicle(others), params)
+        state = numpy_jam.State(body, others, numpy_jam._progress(body), int(rng.integers(100)))
+        mine = jam.start_at(as_vehicle(body), as_vehicle(others), params)
         mine = mine.replace(time=jnp.asarray(state.time, jnp.int32))
         turn = np.stack([np.cos(drive[:, 1]), np.sin(drive[:, 1])], axis=-1)
         draws = jam.Draws(
@@ -61,7 +61,7 @@ def test_the_numpy_step_is_ours_transition_for_transition():
         moved, obstacles, gone = numpy_jam.move(state, action, drive)
         obstacles[gone] = relocated[gone]
         found = numpy_jam.finished(state, moved, obstacles)
-        close(as_rows(reached.agent), found.state.agent)
+        close(as_rows(reached.body), found.state.body)
         close(as_rows(reached.obstacles), found.state.obstacles)
         assert float(outcome.reward) == pytest.approx(found.reward)
         assert float(reached.progress) == found.state.progress
@@ -79,7 +79,7 @@ def test_the_numpy_step_is_ours_transition_for_transition():
 def test_numpy_episodes_begin_and_end():
     rng = np.random.default_rng(1)
     state = numpy_jam.reset(rng)
-    away = np.hypot(*(state.obstacles[:, :2] - state.agent[:2]).T)
+    away = np.hypot(*(state.obstacles[:, :2] - state.body[:2]).T)
     assert (away >= jam.CLEARANCE).all()
     for _ in range(200):
         found = numpy_jam.step(rng, state, 7)

@@ -6,14 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from quick import compile_soon  # noqa: F401
 
 from examples.crossing import world as crossing
 from examples.trolley import world as trolley
-from rp_jax.envs import base, circuit, jam, patrol, point_gather
+from rp_jax.envs import autoreset, circuit, contract, jam, optional, patrol, point_gather
 from rp_jax.hazards import SubRMDP
 
 ENVS = {
@@ -34,7 +31,7 @@ ENVS = {
 }
 GOES_ON = ("point_gather",)  # after a hit: what is hit is gone
 LIMIT, STEPS, ROWS = 25, 300, 7
-FUNCTIONS = ["reset", "step", "observe", "hazards", "causes", "sub_rmdps", "num_actions"]
+FUNCTIONS = ["reset", "step", "observe", "hazards", "sub_rmdps"]  # others are optional
 # One of each module, for tests that are long and to which the variant does not matter.
 EACH_MODULE = {env: name for name, (env, _) in reversed(ENVS.items())}
 every_env = pytest.mark.parametrize("name", ENVS)
@@ -49,15 +46,16 @@ def made(name):
 
 def play(env, row_keys, params):
     """Every row plays at random; returns what each step had and led to, axes (steps, rows)."""
-    actions = env.num_actions(params)
+    actions = optional.num_actions(env, params)
+    hit = functools.partial(optional.collisions, env)
 
     def step(states, t):
         keys = jax.vmap(jax.random.fold_in, (0, None))(row_keys, t)
         pick = lambda key: jax.random.randint(jax.random.fold_in(key, 1), (), 0, actions)  # noqa: E731
         action = jax.vmap(pick)(keys)
-        carried, reached, outcome = base.auto_reset_step(env, keys, states, action, params)
+        carried, reached, outcome = autoreset.auto_reset_step(env, keys, states, action, params)
         look = lambda f: jax.vmap(f, (0, None))(reached, params)  # noqa: E731
-        seen = {name: look(getattr(env, name)) for name in ("observe", "causes", "hazards")}
+        seen = {"observe": look(env.observe), "hazards": look(env.hazards), "collisions": look(hit)}
         data = jax.random.key_data(keys)  # typed keys are no arrays to numpy
         seen |= {"keys": data, "before": states, "action": action}
         return carried, seen | {"reached": reached, "outcome": outcome, "carried": carried}
@@ -124,13 +122,15 @@ def described(tree):
 def test_an_environment_has_every_function_of_the_contract(name):
     env, params = made(name)
     assert all(callable(getattr(env, function)) for function in FUNCTIONS)
-    assert isinstance(env.num_actions(params), int)
-    assert env.num_actions(params) > 1
+    actions = optional.num_actions(env, params)
+    assert isinstance(actions, int)
+    assert actions > 1
     subs = env.sub_rmdps(params)
     assert all(isinstance(sub, SubRMDP) for sub in subs.values())
     state = jax.eval_shape(env.reset, jax.random.key(0), params)
     assert set(jax.eval_shape(env.hazards, state, params)) == set(subs)
-    assert set(jax.eval_shape(env.causes, state, params)) >= set(subs)  # walls may be joint
+    hit = functools.partial(optional.collisions, env)
+    assert set(jax.eval_shape(hit, state, params)) >= set(subs)  # walls may be joint
 
 
 @every_env
@@ -164,10 +164,13 @@ def test_everything_is_double_when_double_precision_is_on(name, x64):
 
 @every_env
 def test_observations_have_the_length_that_learners_are_told(name):
-    env, seen = made(name)[0], played(name)["observe"]
-    assert seen.shape == (STEPS, ROWS, env.LIDAR_BINS + len(env.SCALE))
+    (env, params), seen = made(name), played(name)["observe"]
+    size, bins = optional.observation_size(env, params), optional.lidar_bins(env)
+    scale = optional.scale(env) or (1.0,) * (size - bins)
+    assert seen.shape == (STEPS, ROWS, size)
+    assert size == bins + len(scale)
     assert seen.dtype == jnp.float32
-    assert (seen[..., : env.LIDAR_BINS] >= 0).all()
+    assert (seen[..., :bins] >= 0).all()
 
 
 @every_env
@@ -199,7 +202,7 @@ def test_the_time_limit_truncates_exactly_at_its_step(name):
 def test_danger_is_exactly_where_some_hazard_is_hit(name):
     rows = played(name)
     outcome = rows["outcome"]
-    hit = functools.reduce(np.logical_or, rows["causes"].values())
+    hit = functools.reduce(np.logical_or, rows["collisions"].values())
     assert hit.any()
     np.testing.assert_array_equal(outcome.danger > 0, hit)
     assert ((outcome.terminated & (outcome.danger == 1)) | ~hit | (name in GOES_ON)).all()
@@ -208,7 +211,7 @@ def test_danger_is_exactly_where_some_hazard_is_hit(name):
 
 
 @every_module
-def test_causes_are_hazards_that_are_present_and_hit(name):
+def test_collisions_are_with_hazards_that_are_present_and_hit(name):
     env, params = made(name)
     rows = played(name)
     for kind, sub in env.sub_rmdps(params).items():
@@ -218,8 +221,8 @@ def test_causes_are_hazards_that_are_present_and_hit(name):
         if env is point_gather:  # what was there before the step and is hit is gone after it
             look = jax.vmap(jax.vmap(env.hazards, (0, None)), (0, None))
             states, present = jax.jit(look)(rows["before"], params)[kind]
-        hits = jax.jit(jax.vmap(jax.vmap(over_hazards)))(rows["reached"].agent, states)
-        np.testing.assert_array_equal(rows["causes"][kind], (hits & present).any(axis=-1))
+        hits = jax.jit(jax.vmap(jax.vmap(over_hazards)))(rows["reached"].body, states)
+        np.testing.assert_array_equal(rows["collisions"][kind], (hits & present).any(axis=-1))
 
 
 @every_env
@@ -241,12 +244,12 @@ def test_no_row_of_a_batch_depends_on_the_others(name):
 def test_a_step_can_start_from_any_state_and_has_no_memory(name):
     env, params = made(name)
     rows, (step, _) = played(name), stepper(name)
-    # States of 7 rows at 7 times, and their agents exchanged: situations nobody was in.
+    # States of 7 rows at 7 times, and their bodies exchanged: situations nobody was in.
     mixed = row(rows["before"], np.arange(3, 10) * 20, np.arange(7))
-    agents = row(rows["before"].agent, np.arange(9, 2, -1) * 25, np.arange(7))
+    bodies = row(rows["before"].body, np.arange(9, 2, -1) * 25, np.arange(7))
     times = np.asarray([0, 3, LIMIT - 2, LIMIT - 1, LIMIT, 99, 0], np.int32)
-    mixed = mixed.replace(agent=agents, time=times)
-    action = np.arange(7, dtype=np.int32) % env.num_actions(params)
+    mixed = mixed.replace(body=bodies, time=times)
+    action = np.arange(7, dtype=np.int32) % optional.num_actions(env, params)
     reached, outcome = step(keys_of(2), mixed, action)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((reached, outcome)))
     np.testing.assert_array_equal(reached.time, mixed.time + 1)
@@ -298,110 +301,9 @@ def test_a_parameter_can_be_swept_by_vmap_and_others_changed_without_compiling_a
     assert len(traced) == 1
 
 
-@given(hnp.arrays(bool, 13), st.sampled_from([1, 4, 40]))
-def test_renew_makes_exactly_the_marked_rows(where, chunk):
-    rows = {"a": jnp.arange(13.0), "b": jnp.arange(26).reshape(13, 2)}
-    renewed = renew(jnp.asarray(where), rows, chunk)
-    new = make(jnp.arange(13))
-    expected = {
-        "a": jnp.where(where, new["a"], rows["a"]),
-        "b": jnp.where(where[:, None], new["b"], rows["b"]),
-    }
-    same_bits(renewed, expected)
-
-
-def make(indices):
-    return {"a": 100.0 + indices, "b": jnp.stack([-indices, indices * indices], axis=-1)}
-
-
-@functools.partial(jax.jit, static_argnums=2)
-def renew(where, rows, chunk):
-    return base.renew(where, rows, make, chunk)
-
-
-@pytest.mark.parametrize("marked", [[], [12], [1, 5, 7, 8, 12], list(range(13))])
-@pytest.mark.parametrize("chunk", [4, 16])
-def test_renew_computes_no_row_that_is_not_marked(marked, chunk):
-    asked = []
-
-    def recorded(indices):
-        asked.append(np.asarray(indices).tolist())
-        return make(indices)
-
-    where = jnp.asarray([i in marked for i in range(13)])
-    rows = {"a": jnp.arange(13.0), "b": jnp.arange(26).reshape(13, 2)}
-    with jax.disable_jit():  # so that the loop runs in Python, and calls are seen
-        base.renew(where, rows, recorded, chunk)
-    assert len(asked) == -(-len(marked) // chunk)
-    assert all(len(indices) == chunk for indices in asked)
-    assert sorted(i for indices in asked for i in indices if i < 13) == marked
-
-
-def test_renew_keeps_the_rows_of_any_pytree_with_typed_keys():
-    keys = jax.random.split(jax.random.key(0), 5)
-    others = jax.random.split(jax.random.key(1), 5)
-    where = jnp.asarray([True, False, False, True, False])
-    renewed = base.renew(where, (keys,), lambda i: (others.at[i].get(mode="clip"),), 2)
-    expected = np.where(where[:, None], jax.random.key_data(others), jax.random.key_data(keys))
-    np.testing.assert_array_equal(jax.random.key_data(renewed[0]), expected)
-
-
-class Toy:
-    """Counts to `state["last"]`, which every start draws anew."""
-
-    @staticmethod
-    def reset(key, params):
-        last = jax.random.randint(key, (), 1, params)
-        return {"last": last, "time": jnp.asarray(0, jnp.int32)}
-
-    @staticmethod
-    def step(key, state, action, params):
-        time = state["time"] + 1
-        no = jnp.asarray(False)
-        ended = time >= state["last"]
-        outcome = base.Outcome(
-            reward=action + 0.0, danger=jnp.zeros(()), terminated=ended, truncated=no, goal=no
-        )
-        return {"last": state["last"], "time": time}, outcome
-
-
-def test_what_is_seen_belongs_to_the_states_and_starts_are_looked_at_only_where_needed():
-    keys = jax.random.split(jax.random.key(0), 40)
-    last = jnp.arange(40, dtype=jnp.int32) % 4 + 1
-    states = {"last": last, "time": jnp.ones(40, jnp.int32)}
-    looked = []
-
-    def look(states):
-        looked.append(len(states["time"]))
-        return 1000 * states["last"] + states["time"]
-
-    @jax.jit
-    def advance(keys, states):
-        args = Toy, keys, states, jnp.zeros(40, int), 1000
-        return base.step_and_renew(*args, look), base.auto_reset_step(*args)
-
-    (carried, reached, outcome), unseen = advance(keys, states)
-    same_bits(unseen, (carried[0], reached[0], outcome))
-    np.testing.assert_array_equal(outcome.done, last <= 2)
-    assert set(looked) == {40, 16}  # at all that were reached, and at starts by the chunk
-    np.testing.assert_array_equal(reached[0]["time"], np.full(40, 2))
-    np.testing.assert_array_equal(reached[0]["last"], last)
-    np.testing.assert_array_equal(carried[0]["time"], np.where(outcome.done, 0, 2))
-    fresh = carried[0]["last"][outcome.done]
-    assert len(np.unique(fresh)) > 15
-    for states, seen in (carried, reached):
-        np.testing.assert_array_equal(seen, 1000 * states["last"] + states["time"])
-
-
 def test_the_time_limit_never_hides_a_true_end():
-    terminated, truncated = base.ended(
+    terminated, truncated = contract.ended(
         jnp.asarray([True, False, True, False]), jnp.asarray([5, 5, 4, 4]), jnp.asarray(5)
     )
     np.testing.assert_array_equal(terminated, [True, False, True, False])
     np.testing.assert_array_equal(truncated, [False, True, False, False])
-
-
-def test_select_chooses_whole_pytrees():
-    yes, no = {"a": jnp.ones(3), "b": jnp.asarray(1)}, {"a": jnp.zeros(3), "b": jnp.asarray(0)}
-    same_bits(base.select(jnp.asarray(True), yes, no), yes)
-    same_bits(base.select(jnp.asarray(False), yes, no), no)

@@ -8,8 +8,8 @@ import jax
 import numpy as np
 import pytest
 
+from rp_jax.dynamics import Control, Vehicle
 from rp_jax.envs import circuit, jam, point_gather
-from rp_jax.kinematics import Control, Vehicle
 
 BINS = 360
 VALUES = {"float64": 1e-9, "float32": 1e-5}  # tolerance of states and rewards
@@ -114,15 +114,15 @@ def test_circuit_replays_every_recorded_transition(golden, precision):
     count, tolerance, tie = len(data["t"]), VALUES[precision], TIE[precision]
     params = circuit.make_params()
     states = circuit.State(
-        agent=vehicle(data),
+        body=vehicle(data),
         index=data["prev_index"].astype(np.int32),
         time=np.zeros(count, np.int32),
-        lost=np.zeros(count, bool),
+        hide_position=np.zeros(count, bool),
     )
     step = jax.jit(jax.vmap(circuit.step, (None, 0, 0, None)))
     reached, outcome = step(jax.random.key(0), states, data["action"].astype(np.int32), params)
 
-    same_vehicle(reached.agent, data, tolerance)
+    same_vehicle(reached.body, data, tolerance)
     assert ties(data["min_wall_dist_next"], 0.1, 1e-5) == 0
     assert ties(np.abs(data["v_next"]), 0.005, 1e-5) == 0
     np.testing.assert_array_equal(outcome.terminated, data["crashed"])
@@ -159,7 +159,7 @@ def test_jam_replays_every_recorded_transition(golden, precision, name):
     count, tolerance, tie = len(data["t"]), VALUES[precision], TIE[precision]
     params = jam.make_params(JAMS[name])
     states = jam.State(
-        agent=vehicle(data),
+        body=vehicle(data),
         obstacles=vehicle(data, prefix="cars_"),
         present=np.ones((count, JAMS[name]), bool),
         progress=real(data["prev_progress"]),
@@ -192,7 +192,7 @@ def test_jam_replays_every_recorded_transition(golden, precision, name):
     assert ties(data["pos_next"][:, 1], 3.0, 1e-5) == 0
 
     assert moved.any()
-    same_vehicle(reached.agent, data, tolerance)
+    same_vehicle(reached.body, data, tolerance)
     same_vehicle(reached.obstacles, data, tolerance, prefix="cars_")
     assert reached.present.all()
     same(reached.progress, data["prev_progress_next"], tolerance)
@@ -201,7 +201,7 @@ def test_jam_replays_every_recorded_transition(golden, precision, name):
     np.testing.assert_array_equal(outcome.goal, data["goal"])
     np.testing.assert_array_equal(outcome.terminated, data["crashed"] | data["goal"])
     np.testing.assert_array_equal(outcome.done, data["done"])
-    hit = jax.jit(jax.vmap(jam.causes, (0, None)))(reached, params)
+    hit = jax.jit(jax.vmap(jam.collisions, (0, None)))(reached, params)
     np.testing.assert_array_equal(hit["wall"], data["crashed_wall"])
     np.testing.assert_array_equal(hit["obstacle"], data["crashed_car"])
 
@@ -232,7 +232,7 @@ def gatherers(data, suffix=""):
     """Recorded states of Point Gather; some have three apples."""
     pose, count = data[f"qpos{suffix}"], len(data["t"])
     return point_gather.State(
-        agent=Vehicle(
+        body=Vehicle(
             position=real(pose[:, :2]),
             heading=real(np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1)),
             speed=real(np.zeros(count)),
@@ -281,8 +281,8 @@ def test_point_gather_replays_every_recorded_transition(golden, precision, kind)
     # No object is near the limit of reach, so no row is left out.
     place = data["com_next"][:, None, :2]
     assert ties(np.linalg.norm(data["objects"][..., :2] - place, axis=-1), 1.0, 1e-5) == 0
-    same(reached.agent.position, expected.agent.position, tolerance)
-    same(reached.agent.heading, expected.agent.heading, tolerance)
+    same(reached.body.position, expected.body.position, tolerance)
+    same(reached.body.heading, expected.body.heading, tolerance)
     same(reached.angle, expected.angle, tolerance)
     same(reached.velocity, expected.velocity, tolerance)
     for kind in ("apples", "bombs"):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rp_jax.envs import base, jam
-from rp_jax.kinematics import Control, Vehicle, angle_of
-from rp_jax.sensing import FAR
+from rp_jax.dynamics import Control, Vehicle, angle_of
+from rp_jax.envs import contract, jam
+from rp_jax.envs.sensing import FAR
 
 COAST = 7  # neither acceleration nor turn
 AWAY = (1.5, 1.5)  # where no wall, zone or exit is near
@@ -41,13 +41,13 @@ def at(positions, headings=0.0, speeds=0.0):
 
 
 @jax.jit
-def _settle(agent, obstacles, draws, params):
-    state = jam.start_at(agent, obstacles, params)
+def _settle(body, obstacles, draws, params):
+    state = jam.start_at(body, obstacles, params)
     reached, outcome = jam.transition(state, jnp.asarray(COAST), draws, params)
-    return reached, outcome, jam.causes(reached, params)
+    return reached, outcome, jam.collisions(reached, params)
 
 
-def settled(agent, places, fidelity="released"):
+def settled(body, places, fidelity="released"):
     """(state, outcome, causes) after a step in which the obstacles stand still at `places`.
 
     There are always 17 of them, so that all tests share a compilation: the last place is
@@ -57,7 +57,7 @@ def settled(agent, places, fidelity="released"):
     straight = np.tile(np.float32([1, 0]), (17, 1))
     controls = Control(acceleration=np.zeros(17, np.float32), rotation=straight)
     draws = jam.Draws(controls=controls, relocated=at(np.full((17, 2), 77.0)))
-    return jax.device_get(_settle(agent, at(places), draws, params_of(17, fidelity)))
+    return jax.device_get(_settle(body, at(places), draws, params_of(17, fidelity)))
 
 
 def driven_by(row_keys, t):
@@ -135,7 +135,7 @@ def test_relocated_obstacles_appear_inside_the_room_away_from_the_agent():
     moved = jumps(states)
     assert moved.sum() > 300
     place = states.obstacles.position[1:]
-    gap = np.linalg.norm(place - states.agent.position[1:, :, None], axis=-1)
+    gap = np.linalg.norm(place - states.body.position[1:, :, None], axis=-1)
     assert gap[moved].min() >= 1.0 - 1e-6
     assert place.min() > 0.1
     assert place.max() < 2.9
@@ -159,10 +159,10 @@ def test_obstacles_that_leave_are_moved_at_once_and_no_others_are():
 
 def test_episodes_start_in_the_corner_and_obstacles_anywhere_a_unit_away():
     states = jax.device_get(reset(keys_of(1, 2000), params_of(8)))
-    agent, others = states.agent, states.obstacles
-    np.testing.assert_allclose(agent.position, np.full((2000, 2), 0.2), atol=1e-7)
-    np.testing.assert_array_equal(agent.heading, np.tile([1.0, 0.0], (2000, 1)))
-    assert not agent.speed.any()
+    body, others = states.body, states.obstacles
+    np.testing.assert_allclose(body.position, np.full((2000, 2), 0.2), atol=1e-7)
+    np.testing.assert_array_equal(body.heading, np.tile([1.0, 0.0], (2000, 1)))
+    assert not body.speed.any()
     assert not states.time.any()
     assert states.present.all()
     np.testing.assert_array_equal(states.progress, np.full(2000, -74.0))  # 20 sqrt(2.4^2 + 2.8^2)
@@ -250,7 +250,7 @@ def test_an_obstacle_that_has_disappeared_never_returns_and_hits_nothing():
     params = params_of(3, "paper")
     # The agent stands on the first of three obstacles.
     others = at(np.tile([AWAY, (0.3, 1.5), (1.0, 2.0)], (20, 1, 1)))
-    states = reset(keys_of(0, 20), params).replace(agent=at([AWAY] * 20), obstacles=others)
+    states = reset(keys_of(0, 20), params).replace(body=at([AWAY] * 20), obstacles=others)
     for present, danger in ((True, 1), (False, 0)):
         there = np.tile([present, True, True], (20, 1))
         reached, outcome = step(keys_of(0, 20), states.replace(present=there), still(20), params)
@@ -268,7 +268,7 @@ def test_an_obstacle_that_has_disappeared_never_returns_and_hits_nothing():
 @pytest.mark.parametrize(("fidelity", "whole"), [("released", True), ("paper", False)])
 def test_progress_is_rounded_in_the_released_version_only(fidelity, whole):
     state, outcome, _ = settled(at((1.0, 1.0), 0.8, 0.1), [(2.5, 1.0)], fidelity)
-    to_go = np.asarray([2.6, 3.0]) - np.asarray([[1.0, 1.0], state.agent.position])
+    to_go = np.asarray([2.6, 3.0]) - np.asarray([[1.0, 1.0], state.body.position])
     before, after = -20 * np.linalg.norm(to_go, axis=-1)
     if whole:
         before, after = np.round(before), np.round(after)
@@ -277,7 +277,7 @@ def test_progress_is_rounded_in_the_released_version_only(fidelity, whole):
     assert (float(state.progress) == round(float(state.progress))) == whole
 
 
-@pytest.mark.parametrize("fidelity", base.FIDELITIES)
+@pytest.mark.parametrize("fidelity", contract.FIDELITIES)
 def test_rewards_add_up_to_the_progress_made_less_the_costs(fidelity):
     params = params_of(3, fidelity)
     states = reset(keys_of(6, 20), params)
@@ -313,7 +313,7 @@ def test_driving_out_of_the_exit_is_the_goal(position, goal):
 def test_a_crash_in_the_exit_is_no_goal():
     state, outcome, hit = settled(at((2.6, 2.95), np.pi / 2, 0.1), [(2.7, 2.89)])
     assert hit["obstacle"]
-    assert state.agent.position[1] > 3
+    assert state.body.position[1] > 3
     assert not outcome.goal
     assert outcome.terminated
     assert outcome.danger == 1
@@ -352,19 +352,19 @@ def test_the_eight_nearest_obstacles_are_seen_in_the_order_of_their_distance(num
     params = params_of(num_obstacles)
     states = reset(keys_of(7, 20), params)
     rng = np.random.default_rng(0)
-    agents = at(rng.uniform(0.5, 2.5, (20, 2)), rng.uniform(-3, 3, 20), rng.uniform(-0.1, 0.1, 20))
-    states = jax.device_get(states.replace(agent=agents))
+    bodies = at(rng.uniform(0.5, 2.5, (20, 2)), rng.uniform(-3, 3, 20), rng.uniform(-0.1, 0.1, 20))
+    states = jax.device_get(states.replace(body=bodies))
     seen = np.asarray(observe(states, params), np.float64)[:, 360:]
     turn = lambda vector: vector[..., 0] + 1j * vector[..., 1]  # noqa: E731
-    agent, others = states.agent, states.obstacles
-    ahead = turn(agent.heading.astype(float))[:, None]
-    offset = turn(others.position.astype(float)) - turn(agent.position.astype(float))[:, None]
+    body, others = states.body, states.obstacles
+    ahead = turn(body.heading.astype(float))[:, None]
+    offset = turn(others.position.astype(float)) - turn(body.position.astype(float))[:, None]
     facing, speed = turn(others.heading.astype(float)), others.speed
     pad = max(0, 8 - num_obstacles)
     if pad:
         offset = np.hstack([offset, np.full((20, pad), turn(np.asarray(jam.UNSEEN)))])
         facing = np.hstack([facing, np.repeat(-ahead, pad, axis=1)])
-        speed = np.hstack([speed, np.repeat(agent.speed[:, None], pad, axis=1)])
+        speed = np.hstack([speed, np.repeat(body.speed[:, None], pad, axis=1)])
     order = np.argsort(np.abs(offset), axis=1, kind="stable")[:, :8]
     nearest = lambda values: np.take_along_axis(values, order, axis=1)  # noqa: E731
     local, way = nearest(offset / ahead), np.angle(nearest(facing / ahead))
@@ -372,9 +372,9 @@ def test_the_eight_nearest_obstacles_are_seen_in_the_order_of_their_distance(num
     np.testing.assert_allclose(rows[..., 0] + 1j * rows[..., 1], local, atol=1e-5)
     np.testing.assert_allclose(np.exp(1j * rows[..., 2]), np.exp(1j * way), atol=1e-5)
     np.testing.assert_allclose(rows[..., 3], nearest(speed), atol=1e-6)
-    np.testing.assert_allclose(seen[:, 32:34], agent.position, atol=1e-6)
+    np.testing.assert_allclose(seen[:, 32:34], body.position, atol=1e-6)
     np.testing.assert_allclose(seen[:, 34], np.angle(ahead[:, 0]), atol=1e-5)
-    np.testing.assert_allclose(seen[:, 35], agent.speed, atol=1e-6)
+    np.testing.assert_allclose(seen[:, 35], body.speed, atol=1e-6)
 
 
 def test_fifty_obstacles_can_be_driven_among():
@@ -392,9 +392,9 @@ def test_states_far_from_the_room_can_be_stepped_and_observed():
     params = params_of(3)
     states = reset(keys_of(9, 20), params)
     rng = np.random.default_rng(0)
-    agents = at(rng.uniform(-60, 60, (20, 2)), rng.uniform(-9, 9, 20), np.full(20, 7.0))
+    bodies = at(rng.uniform(-60, 60, (20, 2)), rng.uniform(-9, 9, 20), np.full(20, 7.0))
     others = at(rng.uniform(-60, 60, (20, 3, 2)), 0.0, -3.0)
-    states = states.replace(agent=agents, obstacles=others)
+    states = states.replace(body=bodies, obstacles=others)
     reached, outcome = step(keys_of(0, 20), states, still(20), params)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((reached, outcome)))
     assert np.isfinite(observe(reached, params)).all()
@@ -407,26 +407,26 @@ def test_an_agent_at_nan_does_not_keep_obstacles_searching_for_a_place():
     states = reset(keys_of(10, 20), params)
     lost = at(np.full((20, 2), np.nan))
     out = at(np.full((20, 3, 2), -1.0))
-    reached, _ = step(keys_of(0, 20), states.replace(agent=lost, obstacles=out), still(20), params)
+    reached, _ = step(keys_of(0, 20), states.replace(body=lost, obstacles=out), still(20), params)
     assert (reached.obstacles.position > 0).all()
 
 
 def test_every_wall_point_within_the_threats_window_is_a_hazard():
     params = params_of(3)
     rng = np.random.default_rng(1)
-    agents = at(rng.uniform(0.1, 3.1, (200, 2)), rng.uniform(-3, 3, 200), np.zeros(200))
-    hazards = jax.jit(jax.vmap(lambda agent: jam.hazards(blank(agent), params)["wall"]))
+    bodies = at(rng.uniform(0.1, 3.1, (200, 2)), rng.uniform(-3, 3, 200), np.zeros(200))
+    hazards = jax.jit(jax.vmap(lambda body: jam.hazards(blank(body), params)["wall"]))
 
-    def blank(agent):
-        return jam.start_at(agent, at(np.full((3, 2), 1.5)), params)
+    def blank(body):
+        return jam.start_at(body, at(np.full((3, 2), 1.5)), params)
 
-    points, present = jax.device_get(hazards(agents))
+    points, present = jax.device_get(hazards(bodies))
     np.testing.assert_array_equal(present, points[..., 0] < FAR)
     window = jax.device_get(params.wall.window)
 
     def inside(points):
-        offset = points - np.asarray(agents.position)[:, None]
-        c, s = np.asarray(agents.heading).T[..., None]
+        offset = points - np.asarray(bodies.position)[:, None]
+        c, s = np.asarray(bodies.heading).T[..., None]
         x, y = offset[..., 0] * c + offset[..., 1] * s, offset[..., 1] * c - offset[..., 0] * s
         return window.contains(np.stack([x, y], axis=-1))
 
@@ -489,7 +489,7 @@ def test_obstacles_that_are_absent_stay_away():
     states = jax.device_get(drive(keys_of(2, 50), params, 40))
     assert (states.present == states.present[0]).all()
     assert 0 < states.present[0].mean() < 1
-    hit = jax.jit(jax.vmap(jax.vmap(jam.causes, (0, None)), (0, None)))
+    hit = jax.jit(jax.vmap(jax.vmap(jam.collisions, (0, None)), (0, None)))
     nobody = states.replace(present=np.zeros_like(states.present))
     assert not hit(nobody, params)["obstacle"].any()
 
@@ -497,6 +497,6 @@ def test_obstacles_that_are_absent_stay_away():
 def test_there_are_fifteen_actions_of_three_accelerations_and_five_turns():
     params = params_of(8)
     assert jam.num_actions(params) == 15
-    np.testing.assert_allclose(params.agent.actions.acceleration[::5], [-0.02, 0, 0.02])
-    turns = angle_of(params.agent.actions.rotation[:5])
+    np.testing.assert_allclose(params.body.actions.acceleration[::5], [-0.02, 0, 0.02])
+    turns = angle_of(params.body.actions.rotation[:5])
     np.testing.assert_allclose(turns, [-0.3, -0.1, 0, 0.1, 0.3], atol=1e-6)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rp_jax.dynamics import make_vehicle
 from rp_jax.envs import jam, patrol
-from rp_jax.kinematics import make_vehicle
 
 COAST = 7
 step = jax.jit(patrol.step)

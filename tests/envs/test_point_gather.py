@@ -43,23 +43,23 @@ def after(state, *actions, fidelity="released"):
 def test_a_step_turns_first_and_then_goes_along_the_new_heading():
     reached, _ = after(at(angle=0.5), LEFT)
     expected = [np.cos(0.75), np.sin(0.75)]
-    np.testing.assert_allclose(reached.agent.position, expected, atol=1e-6)
-    np.testing.assert_allclose(reached.agent.heading, expected, atol=1e-6)
-    assert reached.agent.speed == 0
+    np.testing.assert_allclose(reached.body.position, expected, atol=1e-6)
+    np.testing.assert_allclose(reached.body.heading, expected, atol=1e-6)
+    assert reached.body.speed == 0
     back, _ = after(reached, 4)  # a whole step back, without a turn
-    np.testing.assert_allclose(back.agent.position, [0, 0], atol=1e-6)
+    np.testing.assert_allclose(back.body.position, [0, 0], atol=1e-6)
 
 
 def test_turns_add_up_to_more_than_a_full_one():
     reached, _ = after(at(angle=3.0), *[44] * 20)  # on the spot, to the left
     np.testing.assert_allclose(reached.angle, 8.0, atol=1e-5)
-    np.testing.assert_allclose(reached.agent.heading, [np.cos(8), np.sin(8)], atol=1e-5)
+    np.testing.assert_allclose(reached.body.heading, [np.cos(8), np.sin(8)], atol=1e-5)
     assert observe(reached, params_of())[2] == reached.angle
 
 
 def test_walls_hold_the_agent_who_slides_along_them():
     reached, _ = after(at((5.8, 1.0), np.pi / 4), STRAIGHT)
-    np.testing.assert_allclose(reached.agent.position, [6.0, 1 + np.sqrt(0.5)], atol=1e-6)
+    np.testing.assert_allclose(reached.body.position, [6.0, 1 + np.sqrt(0.5)], atol=1e-6)
 
 
 @pytest.mark.parametrize(("fidelity", "ahead"), [("released", point_gather.AHEAD), ("paper", 0.0)])
@@ -110,7 +110,7 @@ def test_starts_spread_the_objects_over_the_cells_without_the_middle():
         assert sum(found) == count
         assert stats.chisquare(found).pvalue > 1e-4
     assert states.apples.present.all()
-    pose = np.concatenate([states.agent.position, states.angle[:, None]], axis=-1)
+    pose = np.concatenate([states.body.position, states.angle[:, None]], axis=-1)
     for values, spread in ((pose, 0.01), (np.asarray(states.velocity), 0.1)):
         np.testing.assert_allclose(values.std(axis=0), spread, rtol=0.05)
         assert (np.abs(values.mean(axis=0)) < 0.1 * spread).all()
@@ -175,7 +175,7 @@ def test_the_threat_is_equal_to_the_sum_over_bombs(position, x64):
     params = point_gather.make_params(2, 3, horizon=2)
     bombs = jnp.asarray(position + np.asarray([[1.5, 0.4], [1.7, -0.6], [-1.2, 0.5]]))
     state = point_gather.start_at(jnp.asarray(position), 0.4, jnp.asarray(FAR), bombs)
-    baseline, beta = params.agent.baseline, params.beta
+    baseline, beta = params.body.baseline, params.beta
     every, key = jnp.arange(81), jax.random.key(0)
 
     def both(first):
@@ -184,10 +184,10 @@ def test_the_threat_is_equal_to_the_sum_over_bombs(position, x64):
         ended = jax.vmap(lambda a: point_gather.step(key, reached, a, params)[1].danger)(every)
         return beta * begun.danger + beta**2 * jnp.sum(baseline.probabilities * ended)
 
-    jax.tree.map(np.testing.assert_array_equal, baseline.controls, params.agent.actions)
+    jax.tree.map(np.testing.assert_array_equal, baseline.controls, params.body.actions)
     truth = jax.jit(jax.vmap(both))(every)
     sub = point_gather.sub_rmdps(params)["bomb"]
-    alone = jax.jit(jax.vmap(exact_threat, (None, None, 0, None)))(key, state.agent, bombs, sub)
+    alone = jax.jit(jax.vmap(exact_threat, (None, None, 0, None)))(key, state.body, bombs, sub)
     assert truth.min() < 0.5 < truth.max()
     assert (alone.threat > 0.01).any(axis=1).all()
     np.testing.assert_allclose(alone.threat.sum(axis=0), truth, atol=1e-9)

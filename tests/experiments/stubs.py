@@ -5,7 +5,7 @@ from PIL import Image
 
 from experiments.paper.commands import COMMANDS
 from rp_jax import storage
-from rp_jax.evaluate import Episodes, summarise
+from rp_jax.evaluation import Episodes, summarise
 
 VARIANTS = {
     "circuit": ("default", "narrowed", "circle"),
@@ -28,7 +28,7 @@ def evaluated(variant, method, seed, rate, score=50.0, episodes=400):
         length=zeros + 10,
         interventions=zeros,
         insecure=zeros,
-        causes={"wall": crashed},
+        collisions={"wall": crashed},
         bad_observations=zeros,
         bad_threats=zeros,
     )

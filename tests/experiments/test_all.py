@@ -327,10 +327,10 @@ def test_walls_jointly_are_never_more_threatening_than_summed():
     params = circuit.make_params(circle_plan(), horizon=2)
     reset = jax.jit(jax.vmap(circuit.reset, (0, None)))
     states = reset(jax.random.split(jax.random.key(0), 8), params)
-    fast = states.replace(agent=states.agent.replace(speed=jnp.full(8, 0.1)))
+    fast = states.replace(body=states.body.replace(speed=jnp.full(8, 0.1)))
     points = jax.jit(jax.vmap(circuit.hazards, (0, None)))(fast, params)["wall"]
     sub = circuit.sub_rmdps(params)["wall"]
-    near = fast.agent.replace(position=points.state[:, 0] + jnp.asarray([0.2, 0.0]))
+    near = fast.body.replace(position=points.state[:, 0] + jnp.asarray([0.2, 0.0]))
     joint, summed = walls.exact(jax.random.key(0), near, points, sub)
     assert 0 < joint.max() <= 1
     assert (joint <= summed + 1e-6).all()

@@ -19,7 +19,7 @@ class Careless(PMDP):
     """Takes no action to be a threat, but the one that leaves the last cell before the pit."""
 
     def threat(self, states, alive=None):
-        near = states.agent.position[:, :1] >= 5
+        near = states.body.position[:, :1] >= 5
         rising = jnp.asarray([[0.2, 0.3, 0.4]])
         return jnp.where(near, rising, 0.0)
 
@@ -48,7 +48,7 @@ def test_each_crash_has_its_last_steps(tmp_path):
         assert crash.hit == ["pit"]
         assert crash.secure.all()
         assert crash.insecure == 0
-        cells = crash.states.agent.position[:, 0]
+        cells = crash.states.body.position[:, 0]
         assert cells[-1] == 5
         assert (crash.action == probe.RIGHT).all()
         assert (np.diff(cells) >= 0).all()

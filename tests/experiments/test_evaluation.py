@@ -10,7 +10,7 @@ from quick import compile_soon, stopped_after  # noqa: F401
 
 from experiments import evaluation, tasks
 from experiments.training import Trained
-from rp_jax import evaluate
+from rp_jax import evaluation
 from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
 from rp_jax.planning import loop
 
@@ -43,6 +43,6 @@ def test_rounds_are_those_of_an_evaluation_at_once_and_go_on_where_they_stopped(
         for i, key in enumerate(tasks.keys_of(members, tasks.EVALUATION)):
             own = jax.tree.map(lambda a, i=i: a[i], weights)
             there = pmdp.replace(params=task.tests[variant], x=np.float32(config.x))
-            at_once = evaluate.play_episodes(key, there, policy(own), 20, batch=8)
+            at_once = evaluation.play_episodes(key, there, policy(own), 20, batch=8)
             mine = jax.tree.map(lambda a, i=i: a[i], rows)
             jax.tree.map(np.testing.assert_array_equal, mine, at_once)

@@ -28,7 +28,7 @@ from experiments.paper import (
 from experiments.paper import training_crashes as crashes
 from experiments.runs import EXPERIMENTS
 from rp_jax import storage
-from rp_jax.evaluate import Episodes, summarise
+from rp_jax.evaluation import Episodes, summarise
 
 PLAIN = [
     name for name in everything.RESULTS if name not in ("fig2", "fig3", "fig6", "timing", "walls")

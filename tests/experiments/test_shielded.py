@@ -28,7 +28,7 @@ def go(out, *options):
 
 def full_speed(env, params, config):
     act = lambda weights, obs, key: jnp.tile(weights, (len(obs), 1))  # noqa: E731
-    return shielded.Policy(act, jnp.asarray([[1.0, 0.0]]), params.agent.shares)
+    return shielded.Policy(act, jnp.asarray([[1.0, 0.0]]), params.body.normalized_actions)
 
 
 @pytest.mark.slow
@@ -48,7 +48,7 @@ def test_every_policy_is_played_without_the_shield_and_with_it(tmp_path, monkeyp
         assert row["episodes"] == 12
         low, high = row["crash_ci95"]
         assert low <= row["crash_rate"] == row["crashes"] / 12 <= high
-        assert sum(row["causes"].values()) >= row["crashes"]
+        assert sum(row["collisions"].values()) >= row["crashes"]
         assert (row["interventions"] > 0) <= (row["shield"] != "none")
     # Straight ahead at full speed ends at the wall, if not before: with no shield to mind.
     assert rows[2]["crashes"] == rows[3]["crashes"] == 12
@@ -67,7 +67,7 @@ def test_a_perfect_threat_of_walls_keeps_a_policy_off_them(monkeypatch):
     monkeypatch.setattr(shielded, "ROUND", 50)
     play = jax.jit(lambda key: shielded.played(key, pmdp, policy.weights, policy, True))
     rows = play(jax.random.key(0))
-    assert not rows.causes["wall"].any()
+    assert not rows.collisions["wall"].any()
     assert rows.interventions.sum() > 0
 
 
@@ -75,7 +75,7 @@ class WallsOnly:
     """Jam, whose obstacles are no hazard to its threat."""
 
     LIDAR_BINS, SCALE = jam.LIDAR_BINS, jam.SCALE
-    reset, step, observe, causes = jam.reset, jam.step, jam.observe, jam.causes
+    reset, step, observe, collisions = jam.reset, jam.step, jam.observe, jam.collisions
     clearance, num_actions = jam.clearance, jam.num_actions
 
     @staticmethod

@@ -24,11 +24,11 @@ from rp_jax.planning import loop
         ("penalty", (-1.0, float("inf"))),
         ("learning_penalty", (-1.0, float("nan"))),
         ("learning_penalty_from", (-1.0, float("inf"))),
-        ("learning_toll", (-1.0, float("inf"))),
+        ("insecure_penalty", (-1.0, float("inf"))),
         ("baseline", ("brave", "")),
         ("episodes", (0, -10, 2.5)),
         ("fidelity", ("text", "")),
-        ("lost", (-0.1, 1.5, float("nan"))),
+        ("hide_position", (-0.1, 1.5, float("nan"))),
         ("planning", (loop.LoopConfig(steps=7), loop.LoopConfig(num_envs=0))),
     ],
 )
@@ -61,14 +61,19 @@ def test_methods_are_named_by_what_sets_them_apart():
 
 
 def test_what_learned_to_do_without_x_and_y_is_told_them_only_on_its_own_track():
-    def lost(**changes):
+    def hide_position(**changes):
         task = circuit.make_task(circuit.Config(**changes))
-        return float(task.train.lost), {name: float(p.lost) for name, p in task.tests.items()}
+        return float(task.train.hide_position), {
+            name: float(p.hide_position) for name, p in task.tests.items()
+        }
 
-    assert lost() == (0.0, {"default": 0.0, "narrowed": 0.0, "circle": 0.0})
-    assert lost(lost=0.25) == (0.25, {"default": 0.0, "narrowed": 0.0, "circle": 1.0})
+    assert hide_position() == (0.0, {"default": 0.0, "narrowed": 0.0, "circle": 0.0})
+    assert hide_position(hide_position=0.25) == (
+        0.25,
+        {"default": 0.0, "narrowed": 0.0, "circle": 1.0},
+    )
     swapped = {"track": "circle", "test_tracks": ("circle", "narrowed")}
-    assert lost(lost=0.25, **swapped) == (0.25, {"circle": 0.0, "narrowed": 1.0})
+    assert hide_position(hide_position=0.25, **swapped) == (0.25, {"circle": 0.0, "narrowed": 1.0})
 
 
 def test_the_threshold_is_nowhere_above_what_was_asked_for():

@@ -20,7 +20,7 @@ def jam_pmdp(x):
     models = {}
     for i, (kind, sub) in enumerate(sorted(jam.sub_rmdps(params).items())):
         network = ThreatNetwork((8,), 15)
-        size = len(sub.source.features(*sub.source.sample(jax.random.key(0), sub.agent)))
+        size = len(sub.source.features(*sub.source.sample(jax.random.key(0), sub.body)))
         weights = network.init(jax.random.key(i), jnp.zeros(size))
         scale = jnp.ones(size)
         models[kind] = ThreatModel(sub.source, weights, scale, jnp.asarray(-4.0), network)
@@ -46,6 +46,15 @@ def test_what_is_admissible_is_what_is_admissible_at_that_threshold(x):
     np.testing.assert_array_equal(found.admissible[~near.any(1)], plain.admissible[~near.any(1)])
     np.testing.assert_allclose(found.threat * x, plain.threat, rtol=1e-5)
     assert 0 < np.asarray(plain.admissible).mean() < 1
+
+
+def test_without_a_shield_all_is_admissible_at_any_threshold():
+    pmdp = probe.make_pmdp(probe, probe.make_params(), x=np.inf)
+    beside = jax.vmap(probe.start_at)(jnp.asarray([5.0, 6.0]))
+    wrapped, marked = at(pmdp, beside, 0.01)
+    percept = wrapped.perceive(marked)
+    assert percept.admissible.all()
+    np.testing.assert_array_equal(percept.threat, 0)
 
 
 def test_the_threshold_is_seen_after_all_else():

@@ -10,7 +10,7 @@ from quick import compile_soon  # noqa: F401
 from rp_jax import shield
 from rp_jax.planning import dqn
 from rp_jax.planning.dqn import DQNConfig, Learner, Transition
-from rp_jax.planning.pmdp import Encoded
+from rp_jax.planning.percept import Encoded
 
 CONFIG = DQNConfig(gamma=0.9, learning_rate=0.01, anneal=False, polyak=0.1, reward_scale=1.0)
 UPDATES = 10
@@ -30,14 +30,13 @@ def named(*states):
 
 
 def batch(states, actions, rewards, discounts, reached, masks):
-    bits = jax.vmap(shield.to_bits)(jnp.asarray(masks))
     return Transition(
         encoded=named(*states),
         action=jnp.asarray(actions, jnp.int32),
         reward=jnp.asarray(rewards, jnp.float32),
         discount=jnp.asarray(discounts, jnp.float32),
         next_encoded=named(*reached),
-        next_admissible=bits,
+        next_admissible=jnp.asarray(masks, bool),
     )
 
 

@@ -1,5 +1,6 @@
 import dataclasses
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +9,8 @@ import probe
 import pytest
 from quick import unoptimised
 
-from rp_jax import evaluate
-from rp_jax.envs import base
+from rp_jax import evaluation
+from rp_jax.envs import tally
 from rp_jax.planning import loop
 from rp_jax.planning.dqn import DQNConfig
 from rp_jax.planning.loop import LoopConfig
@@ -84,10 +85,10 @@ def play(method):
 
     @jax.jit
     def episodes(params, pmdp):
-        values = evaluate.action_values(network, params)
-        return evaluate.run_episodes(jax.random.key(2), pmdp, values, 50, batch=50)
+        values = evaluation.action_values(network, params)
+        return evaluation.run_episodes(jax.random.key(2), pmdp, values, 50, batch=50)
 
-    return evaluate.summarise(episodes(state.learner.params, pmdp), 0.0)
+    return evaluation.summarise(episodes(state.learner.params, pmdp), 0.0)
 
 
 def test_behind_the_shield_the_pit_is_never_entered_not_even_while_learning():
@@ -112,19 +113,19 @@ def test_a_penalty_teaches_to_avoid_the_pit_by_falling_into_it():
     assert found["goal_rate"] == 1
 
 
-def test_a_toll_is_taken_wherever_nothing_is_admissible():
+def test_a_penalty_is_taken_wherever_nothing_is_admissible():
     _, state, _ = learned("RP")
     taken = []
-    for toll in (0.0, 2.0):
+    for insecure_penalty in (0.0, 2.0):
         for x in (0.5, -1.0):  # everything secure on the way, and nothing
-            pmdp = probe.make_pmdp(probe, PARAMS, x=x, toll=toll)
+            pmdp = probe.make_pmdp(probe, PARAMS, x=x, insecure_penalty=insecure_penalty)
             network = loop.make_network(CONFIG, pmdp)
             after, _ = loop.interact(jax.random.key(0), state, pmdp, network, CONFIG)
             taken.append(jax.tree.map(lambda a: np.asarray(a)[-1], after.window))
-    free, free_lost, tolled, tolled_lost = taken
-    np.testing.assert_array_equal(free.reward, tolled.reward)
+    free, free_lost, dear, dear_lost = taken
+    np.testing.assert_array_equal(free.reward, dear.reward)
     expected = free_lost.reward - 2.0 * ~free_lost.terminated
-    np.testing.assert_array_equal(tolled_lost.reward, expected)
+    np.testing.assert_array_equal(dear_lost.reward, expected)
 
 
 def test_without_shield_and_penalty_the_bait_is_taken():
@@ -214,11 +215,12 @@ def test_one_program_fills_the_replay_and_then_learns(compile_soon):
     program = jax.jit(functools.partial(loop.chunk, pmdp=pmdp, config=CONFIG))
     begun = jax.jit(loop.begin, static_argnums=2)(jax.random.key(4), pmdp, CONFIG)
     assert (begun.iteration, begun.replay.current_index) == (-1, 0)
-    early, _ = program(begun, iterations=1, updates=0)  # the windows hold two steps
+    early, opening = program(begun, iterations=CONFIG.opening, updates=0)
+    early = loop.emptied(early, CONFIG)  # the windows hold one step of two
     assert (early.iteration, early.replay.current_index) == (0, 0)
-    state, metrics = program(begun, iterations=CONFIG.filling, updates=0)
+    state, metrics = program(early, iterations=CONFIG.filling, updates=0)
     assert (state.iteration, state.replay.current_index) == (10, 320)
-    assert (metrics.steps, metrics.loss) == (11 * 32, 0)
+    assert (opening.steps, metrics.steps, metrics.loss) == (32, 10 * 32, 0)
     assert state.learner.updates == 0
     assert alike(state.learner.params, begun.learner.params)
     state, metrics = program(state, iterations=3, updates=1)
@@ -255,11 +257,12 @@ def test_no_key_is_used_twice(monkeypatch):
         return state, 0.0
 
     monkeypatch.setattr(loop, "make_network", lambda *_: None)
-    monkeypatch.setattr(loop, "_store", lambda state, _: state.replay)
+    monkeypatch.setattr(loop, "make_replay", lambda _: SimpleNamespace(add=lambda kept, _: kept))
+    monkeypatch.setattr(loop, "_oldest", lambda *_: None)
     monkeypatch.setattr(loop, "interact", act)
     monkeypatch.setattr(loop, "learn", learn)
     blank = dict.fromkeys(loop.LoopState._fields, jnp.zeros(()))
-    running = base.Running(jnp.zeros(()), jnp.zeros(()))
+    running = tally.Running(jnp.zeros(()), jnp.zeros(()))
     state = loop.LoopState(**{**blank, "running": running, "key": jax.random.key(0)})
     with jax.disable_jit():
         loop.chunk(state, None, dataclasses.replace(CONFIG, updates=2), 5)
@@ -296,7 +299,43 @@ def test_the_replay_holds_what_happened_and_no_more():
     np.testing.assert_allclose(kept.discount, np.where(ended, 0, gamma**length), rtol=1e-5)
     np.testing.assert_allclose(kept.reward, np.where(ended, gamma ** (length - 1), 0), rtol=1e-5)
     # What is admissible where it led: not to the right, beside the pit.
-    np.testing.assert_array_equal(kept.next_admissible[:, 0], np.where(to == 5, 0b011, 0b111))
+    wanted = np.where((to == 5)[:, None], [True, True, False], [True, True, True])
+    np.testing.assert_array_equal(kept.next_admissible, wanted)
+
+
+@pytest.mark.parametrize("prioritised", [False, True])
+def test_nothing_of_half_filled_windows_is_in_the_replay(prioritised, monkeypatch, compile_soon):
+    """Everyone walks to the pit, and after a fresh start again; four steps, by hand."""
+    always = lambda *_: jnp.asarray(probe.RIGHT, jnp.int32)  # noqa: E731
+    monkeypatch.setattr(loop, "_choose", always)
+    config = dataclasses.replace(CONFIG, n_step=3, replay_start=64, prioritised=prioritised)
+    assert (config.opening, config.filling) == (2, 2)
+    pmdp = probe.make_pmdp(probe, probe.make_params(slip=0.0), 0.5, penalty=1.0)
+    state, metrics = jax.jit(lambda key: loop.init(key, pmdp, config))(jax.random.key(12))
+    assert (state.iteration, metrics.steps) == (2, 4 * 32)
+    count, kept = items(state)
+    assert count == 64  # the windows of steps 0 to 2, then those of steps 1 to 3
+    starts = kept.encoded.rest[:32, 0]
+    # start: (cell, time, cell reached, time then, reward, discount) of both windows. The pit at 6
+    # pays 3 - 1; gamma is .9.
+    by_hand = {
+        2: [(2, 0, 5, 3, 0.0, 0.9**3), (3, 1, 6, 4, 0.81 * 2, 0.0)],
+        3: [(3, 0, 6, 3, 0.81 * 2, 0.0), (4, 1, 6, 3, 0.9 * 2, 0.0)],
+        4: [(4, 0, 6, 2, 0.9 * 2, 0.0), (5, 1, 6, 2, 2.0, 0.0)],
+    }
+    assert set(starts) == set(by_hand)
+    wanted = [by_hand[int(start)][window] for window in (0, 1) for start in starts]
+    found = [
+        kept.encoded.rest,
+        kept.next_encoded.rest,
+        kept.reward[:, None],
+        kept.discount[:, None],
+    ]
+    np.testing.assert_allclose(np.concatenate(found, axis=1), wanted, rtol=1e-6)
+    assert (kept.action == probe.RIGHT).all()
+    # At the pit's edge not to the right; in it nothing is admissible but the first of equals.
+    masks = {5: [True, True, False], 6: [True, False, False]}
+    np.testing.assert_array_equal(kept.next_admissible, [masks[row[2]] for row in wanted])
 
 
 def test_the_replay_starts_with_the_asked_number_of_transitions(compile_soon):
@@ -334,8 +373,8 @@ def test_the_carried_view_is_that_of_the_carried_states():
     percept = jax.jit(pmdp.perceive)(state.states)
     assert alike(percept.encoded, state.seen.encoded)
     np.testing.assert_array_equal(percept.threat, state.seen.threat)
-    allowed = np.asarray(state.seen.bits) >> np.arange(3) & 1
-    np.testing.assert_array_equal(allowed, percept.admissible)
+    np.testing.assert_array_equal(state.seen.admissible, percept.admissible)
+    assert state.seen.admissible.dtype == bool
 
 
 @pytest.mark.parametrize(
@@ -362,11 +401,10 @@ def test_inadmissible_actions_are_counted_if_there_are_any(compile_soon):
     pmdp, _, _ = learned("RP")
     state, _ = start(jax.random.key(7), pmdp, CONFIG)
     beside = jax.vmap(probe.start_at)(jnp.full(32, 5.0))
-    forged = jnp.full(
-        (32, 1), 1 << probe.RIGHT, jnp.uint32
-    )  # a mask that lets all walk into the pit
+    # A mask that lets all walk into the pit.
+    forged = jnp.tile(jnp.arange(3) == probe.RIGHT, (32, 1))
     honest = jax.jit(loop._look)(pmdp, beside)
-    seen = honest._replace(bits=forged)
+    seen = honest._replace(admissible=forged)
     forced = state._replace(states=beside, seen=seen)
     network = loop.make_network(CONFIG, pmdp)
     act = jax.jit(loop.interact, static_argnums=(3, 4))
@@ -438,13 +476,13 @@ def test_exploration_falls_to_its_end_and_stays():
 
 
 def test_choices_are_greedy_or_uniform_inside_the_mask():
-    values, bits = jnp.asarray([1.0, 5.0, 9.0]), jnp.asarray([0b011], jnp.uint32)
+    values, mask = jnp.asarray([1.0, 5.0, 9.0]), jnp.asarray([True, True, False])
     keys = jax.random.split(jax.random.key(11), 2000)
     choose = jax.jit(jax.vmap(loop._choose, (0, None, None, None)))
-    assert (choose(keys, values, bits, 0.0) == 1).all()
-    always = np.bincount(choose(keys, values, bits, 1.0), minlength=3) / 2000
+    assert (choose(keys, values, mask, 0.0) == 1).all()
+    always = np.bincount(choose(keys, values, mask, 1.0), minlength=3) / 2000
     np.testing.assert_allclose(always, [0.5, 0.5, 0.0], atol=0.05)
-    half = np.bincount(choose(keys, values, bits, 0.5), minlength=3) / 2000
+    half = np.bincount(choose(keys, values, mask, 0.5), minlength=3) / 2000
     np.testing.assert_allclose(half, [0.25, 0.75, 0.0], atol=0.05)
 
 

@@ -6,7 +6,7 @@ from quick import compile_soon  # noqa: F401
 from scipy.special import expit
 
 from rp_jax.planning.networks import NETWORKS, POOLS, PaperNetwork, TunedNetwork
-from rp_jax.planning.pmdp import Encoded
+from rp_jax.planning.percept import Encoded
 
 SCALE = (1.0, 0.5, 10.0)
 start = jax.jit(lambda network, key, seen: network.init(key, seen), static_argnums=0)

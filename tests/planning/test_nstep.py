@@ -3,13 +3,13 @@ import numpy as np
 import pytest
 
 from rp_jax.planning.nstep import Taken, n_step_transition
-from rp_jax.planning.pmdp import Encoded
+from rp_jax.planning.percept import Encoded
 
 GAMMA = 0.9
 
 
 def window(rewards, terminated, done):
-    """Steps from state i to state i + 1; what they lead to is named by 10 and by bits."""
+    """Steps from state i to state i + 1, which 10 + i and a mask of action i alone name."""
     n = len(rewards)
     seen = lambda names: Encoded(jnp.zeros((n, 1), jnp.uint8), names[:, None])  # noqa: E731
     count = jnp.arange(n, dtype=jnp.float32)
@@ -20,7 +20,7 @@ def window(rewards, terminated, done):
         terminated=jnp.asarray(terminated, bool),
         done=jnp.asarray(done, bool),
         next_encoded=seen(10 + count),
-        next_admissible=jnp.arange(n, dtype=jnp.uint32)[:, None] + 100,
+        next_admissible=jnp.eye(n, dtype=bool),
     )
 
 
@@ -50,7 +50,7 @@ def test_it_reaches_to_the_first_end_and_only_a_true_end_cuts_the_future(case):
     assert found.encoded.rest.item() == 0
     assert found.action == 5
     assert found.next_encoded.rest.item() == 10 + counted - 1
-    assert found.next_admissible[0] == 100 + counted - 1
+    np.testing.assert_array_equal(found.next_admissible, np.arange(3) == counted - 1)
 
 
 @pytest.mark.parametrize(("terminated", "discount"), [(False, GAMMA), (True, 0.0)])

@@ -4,8 +4,9 @@ import numpy as np
 import probe
 from quick import compile_soon  # noqa: F401
 
+from rp_jax.dynamics import num_threats
 from rp_jax.envs import circuit, jam
-from rp_jax.planning.pmdp import OUTCOMES, PMDP, encode
+from rp_jax.planning.pmdp import OUTCOMES, PMDP
 from rp_jax.threat.model import ThreatModel, ThreatNetwork
 from rp_jax.threat.static import bounded, plan_clearance, static_threat
 from rp_jax.threat.total import total_threat
@@ -15,31 +16,6 @@ PARAMS = probe.make_params()
 
 def states(cells):
     return jax.vmap(probe.start_at)(jnp.asarray(cells, float))
-
-
-def test_bins_where_nothing_is_seen_are_the_farthest():
-    observation = jnp.asarray([0.0, 0.5, 1.0, 0.2, 3.0, -4.0])
-    encoded = encode(observation, 4, 1)
-    assert encoded.scan.dtype == jnp.uint8
-    assert encoded.scan.tolist() == [255, 128, 255, 51]  # 127.5 rounds to even
-    np.testing.assert_array_equal(encoded.rest, [3.0, -4.0])
-
-
-def test_pooling_keeps_the_nearest_of_its_neighbours():
-    scan = [0.0, 0.9, 0.4, 0.0, 0.0, 0.0, 0.1, 1.0]
-    encoded = encode(jnp.asarray([*scan, 7.0]), 8, 2)
-    assert encoded.scan.tolist() == [230, 102, 255, 26]
-    assert encode(jnp.asarray([*scan, 7.0]), 8, 4).scan.tolist() == [102, 26]
-    assert encode(jnp.asarray([*scan, 7.0]), 8, 8).scan.tolist() == [26]
-
-
-def test_pooling_never_hides_what_is_nearer():
-    rng = np.random.default_rng(0)
-    scan = np.where(rng.random((50, 360)) < 0.4, 0.0, rng.uniform(0.01, 1, (50, 360)))
-    rest = np.zeros((50, 2))
-    observations = jnp.asarray(np.concatenate([scan, rest], axis=-1), jnp.float32)
-    one, eight = (jax.vmap(encode, (0, None, None))(observations, 360, p).scan for p in (1, 8))
-    np.testing.assert_array_equal(eight, np.asarray(one).reshape(50, 45, 8).min(axis=-1))
 
 
 def test_it_perceives_what_is_there():
@@ -103,7 +79,7 @@ def test_the_threshold_and_the_penalty_can_be_swept():
     pmdp = probe.make_pmdp(probe, PARAMS)
     sweep = pmdp.replace(x=jnp.asarray([0.5, 1e-12, jnp.inf]))
     axes = pmdp.replace(
-        params=None, threats=None, x=0, penalty=None, toll=None
+        params=None, threats=None, x=0, penalty=None, insecure_penalty=None
     )  # the same shape, with the axes as leaves
     percepts = jax.jit(jax.vmap(lambda p, s: p.perceive(s), (axes, None)))(sweep, states([5, 6]))
     right = percepts.admissible[:, 0, probe.RIGHT]
@@ -113,19 +89,19 @@ def test_the_threshold_and_the_penalty_can_be_swept():
 
 def under_plans(env, params, models):
     zero = jnp.zeros(())
-    return PMDP(params, models, x=jnp.asarray(0.01), penalty=zero, toll=zero, env=env)
+    return PMDP(params, models, x=jnp.asarray(0.01), penalty=zero, insecure_penalty=zero, env=env)
 
 
 def beside_an_obstacle():
     """Jam under plans with an untrained model, and five states."""
     params = jam.make_params(3, baseline="plans")
     sub = jam.sub_rmdps(params)["obstacle"]
-    network = ThreatNetwork((8,), sub.agent.num_threats, "silu")
+    network = ThreatNetwork((8,), num_threats(sub.body), "silu")
     weights = jax.tree.map(lambda a: 3 * a, network.init(jax.random.key(0), jnp.zeros(6)))
     model = ThreatModel(sub.source, weights, jnp.full(6, 3.0), jnp.asarray(-1.0), network)
     start = jax.vmap(jam.reset, (0, None))(jax.random.split(jax.random.key(1), 5), params)
-    near = start.agent.replace(position=start.obstacles.position[:, 0] + 0.3)
-    return params, model, start.replace(agent=near)
+    near = start.body.replace(position=start.obstacles.position[:, 0] + 0.3)
+    return params, model, start.replace(body=near)
 
 
 def test_under_plans_an_action_is_as_good_as_its_best_plan():
@@ -137,9 +113,9 @@ def test_under_plans_an_action_is_as_good_as_its_best_plan():
     def room(position):
         return jam.clearance(position, params)
 
-    clear = jax.vmap(lambda agent: plan_clearance(agent, params.agent, room))(start.agent)
+    clear = jax.vmap(lambda body: plan_clearance(body, params.body, room))(start.body)
     hazards = jax.vmap(jam.hazards, (0, None))(start, params)
-    moving = bounded(total_threat({"obstacle": model}, start.agent, hazards)).reshape(5, 9, 15)
+    moving = bounded(total_threat({"obstacle": model}, start.body, hazards)).reshape(5, 9, 15)
     every = np.asarray(static_threat(clear) + moving)
     np.testing.assert_allclose(found, every.min(axis=1), rtol=1e-5)
     assert (every.argmin(axis=1) > 0).any()  # braking at once is not always best
@@ -153,8 +129,8 @@ def test_under_plans_walls_need_no_model():
     params = circuit.make_params(baseline="plans")
     pmdp = under_plans(circuit, params, {})
     start = jax.vmap(circuit.reset, (0, None))(jax.random.split(jax.random.key(0), 4), params)
-    ahead = start.agent.replace(position=start.agent.position + 0.19 * start.agent.heading)
-    percept = jax.jit(pmdp.perceive)(start.replace(agent=ahead.replace(speed=jnp.full(4, 0.1))))
+    ahead = start.body.replace(position=start.body.position + 0.19 * start.body.heading)
+    percept = jax.jit(pmdp.perceive)(start.replace(body=ahead.replace(speed=jnp.full(4, 0.1))))
     assert set(np.unique(percept.threat >= 2)) <= {False, True}
     assert ((percept.threat == 0) | (percept.threat >= 2)).all()
     assert percept.admissible.any(axis=-1).all()

@@ -47,9 +47,9 @@ def test_uniform_draws_lie_in_reach_and_fill_it(env, kind):
     quarter = np.quantile((np.asarray(drawn[:, :2]) - low) / (high - low), [0.25, 0.75], axis=0)
     np.testing.assert_allclose(quarter, [[0.25, 0.25], [0.75, 0.75]], atol=0.05)
     own = np.asarray(drawn[:, -1])
-    for speed in np.asarray(sub.agent.speeds):
-        assert (own == speed).mean() > 0.25 / len(sub.agent.speeds)
-    assert (~np.isin(own, np.asarray(sub.agent.speeds))).mean() > 0.4
+    for speed in np.asarray(sub.body.speeds):
+        assert (own == speed).mean() > 0.25 / len(sub.body.speeds)
+    assert (~np.isin(own, np.asarray(sub.body.speeds))).mean() > 0.4
 
 
 def test_uniform_draws_follow_their_key():

@@ -17,7 +17,7 @@ def test_the_joint_model_moves_each_part_by_its_own_law():
     one, two = model.hazards
     for o, p, q, a in np.ndindex(3, 3, 3, 2):
         expected = np.einsum(
-            "i,j,k->ijk", model.agent[o, a], one.transition[o, a, p], two.transition[o, a, q]
+            "i,j,k->ijk", model.body[o, a], one.transition[o, a, p], two.transition[o, a, q]
         )
         np.testing.assert_allclose(kernel[o, p, q, a], expected, atol=1e-14)
         hit = max(one.hits[o, p, a], two.hits[o, q, a])
@@ -69,7 +69,7 @@ def test_a_baseline_that_sees_the_obstacles_breaks_theorem_3():
         still = jnp.broadcast_to(jnp.eye(2), (1, 2, 2, 2))
         hazards.append(factored.Hazard(still, hits, jnp.asarray([0.0, 1.0])))
     model = factored.Factored(
-        agent=stay,
+        body=stay,
         reward=jnp.zeros((1, 2)),
         start=jnp.ones(1),
         hazards=hazards,

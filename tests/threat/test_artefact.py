@@ -157,10 +157,10 @@ def test_another_body_is_refused(tmp_path):
     subs = trolley.sub_rmdps(trolley.make_params())
     models = {"cart": models_of(jam)["wall"]}
     artefact.save(tmp_path, "trolley", models, subs, {})
-    agent = subs["cart"].agent
-    heavy = agent.replace(model=agent.model.replace('mass="1"', 'mass="2"'))
-    subs["cart"] = subs["cart"].replace(agent=heavy)
-    refused(tmp_path, "cart: agent/model is <mujoco.*; for this .* must be", "trolley", subs)
+    body = subs["cart"].body
+    heavy = body.replace(model=body.model.replace('mass="1"', 'mass="2"'))
+    subs["cart"] = subs["cart"].replace(body=heavy)
+    refused(tmp_path, "cart: body/model is <mujoco.*; for this .* must be", "trolley", subs)
 
 
 @pytest.mark.parametrize("statics", [[], {"wall": None}, {"wall": {"source/horizon": [5]}}])
@@ -176,17 +176,17 @@ def test_what_was_saved_without_statics_still_loads(saved):
 
 def test_another_baseline_policy_is_refused(saved):
     subs = dict(subs_of(jam))
-    agent = subs["wall"].agent
-    timid = agent.baseline.replace(probabilities=jnp.full(9, 1 / 9))
-    subs["wall"] = subs["wall"].replace(agent=agent.replace(baseline=timid))
-    refused(saved, "wall: agent/baseline/probabilities is", subs=subs)
+    body = subs["wall"].body
+    timid = body.baseline.replace(probabilities=jnp.full(9, 1 / 9))
+    subs["wall"] = subs["wall"].replace(body=body.replace(baseline=timid))
+    refused(saved, "wall: body/baseline/probabilities is", subs=subs)
 
 
 def test_other_actions_are_refused(saved):
     subs = dict(subs_of(jam))
-    agent = subs["wall"].agent
-    few = jax.tree.map(lambda table: table[:14], agent.actions)
-    subs["wall"] = subs["wall"].replace(agent=agent.replace(actions=few))
+    body = subs["wall"].body
+    few = jax.tree.map(lambda table: table[:14], body.actions)
+    subs["wall"] = subs["wall"].replace(body=body.replace(actions=few))
     refused(saved, "it must be float32", subs=subs)
 
 

@@ -17,6 +17,8 @@ from rp_jax.threat.fit import Dataset, FitConfig
 TINY = ThreatConfig(
     states=150,
     paths=8,
+    sampling="uniform",
+    miss_rate=1.0,
     test_states=150,
     test_paths=8,
     fit=FitConfig(hidden=(16,), steps=200, batch=64, learning_rate=1e-2),
@@ -45,11 +47,11 @@ def short(env):
 
 @functools.cache
 def built(env, kind, way):
-    """A model learned in the given way of sampling, the latter with prudence; and the progress."""
+    """A model learned in the given way of sampling, the latter calibrated; and the progress."""
     sub = short(env)[kind]
-    prudence = 1.0 if way == "uniform" else 0.01
+    miss_rate = 1.0 if way == "uniform" else 0.01
     states = 150 if way == "uniform" else 300  # in two parts of the same shape
-    config = dataclasses.replace(TINY, states=states, sampling=way, prudence=prudence)
+    config = dataclasses.replace(TINY, states=states, sampling=way, miss_rate=miss_rate)
     told, fitted = [], build.fitted
 
     def spy(key, sub, data, *rest, **more):
@@ -160,9 +162,9 @@ def test_a_fit_takes_no_fewer_steps_than_asked():
         ({"states": -5}, "states"),
         ({"paths": 1}, "paths"),
         ({"sampling": "clever"}, "sampling"),
-        ({"prudence": 0.0}, "prudence"),
-        ({"prudence": 1.5}, "prudence"),
-        ({"prudence": float("nan")}, "prudence"),
+        ({"miss_rate": 0.0}, "miss_rate"),
+        ({"miss_rate": 1.5}, "miss_rate"),
+        ({"miss_rate": float("nan")}, "miss_rate"),
         ({"confidence": 1.0}, "confidence"),
         ({"test_states": 9}, "test_states"),
         ({"test_paths": 0}, "test_paths"),

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from quick import compile_soon  # noqa: F401
 
+from rp_jax.dynamics import angle_of
 from rp_jax.envs import circuit, jam
-from rp_jax.kinematics import angle_of
 from rp_jax.recon import sampling
 from rp_jax.threat import fit
 from rp_jax.threat.fit import Dataset, FitConfig
@@ -134,8 +134,8 @@ def test_mirroring_adds_each_state_seen_in_a_mirror(env, kind):
     np.testing.assert_array_equal(both.threat[:50], threat)
     flipped = np.asarray(features) * [1, -1, 1, -1, 1, 1][: features.shape[1]]
     np.testing.assert_allclose(both.features[50:], flipped)
-    turns = np.degrees(np.asarray(angle_of(sub.agent.actions.rotation)))
-    gains = np.asarray(sub.agent.actions.acceleration)
+    turns = np.degrees(np.asarray(angle_of(sub.body.actions.rotation)))
+    gains = np.asarray(sub.body.actions.acceleration)
     for mine, its in enumerate(np.asarray(both.threat[50], int)):
         assert turns[mine] == pytest.approx(-turns[its], abs=1e-4)
         assert gains[mine] == gains[its]

@@ -5,9 +5,9 @@ import pytest
 from quick import compile_soon  # noqa: F401
 from scipy import stats
 
+from rp_jax.dynamics import Vehicle
 from rp_jax.envs import jam
-from rp_jax.envs.base import Hazards
-from rp_jax.kinematics import Vehicle
+from rp_jax.envs.contract import Hazards
 from rp_jax.recon.labels import exact_threat
 from rp_jax.threat.model import ThreatModel, ThreatNetwork
 from rp_jax.threat.report import compare, labelled_sum, predict
@@ -71,22 +71,22 @@ def crowd(seed, count, points):
     rng = np.random.default_rng(seed)
     angle = rng.uniform(-np.pi, np.pi, count)
     place = rng.uniform(0, 3, (count, 2))
-    agents = Vehicle(
+    bodies = Vehicle(
         position=jnp.asarray(place, jnp.float32),
         heading=jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], -1), jnp.float32),
         speed=jnp.asarray(rng.choice(jam.SPEEDS, count), jnp.float32),
     )
     walls = place[:, None] + rng.uniform(-0.7, 0.7, (count, points, 2))
     present = jnp.asarray(np.arange(count * points).reshape(count, points) % 3 > 0)
-    return agents, Hazards(jnp.asarray(walls, jnp.float32), present)
+    return bodies, Hazards(jnp.asarray(walls, jnp.float32), present)
 
 
 def test_labelled_sums_add_the_labels_of_hazards_in_reach(exact):
-    agents, hazards = crowd(0, 6, 20)
-    found = labelled_sum(jax.random.key(0), agents, hazards, SUB, exact_threat)
-    features = jax.vmap(jax.vmap(SUB.source.features, (None, 0)))(agents, hazards.state)
+    bodies, hazards = crowd(0, 6, 20)
+    found = labelled_sum(jax.random.key(0), bodies, hazards, SUB, exact_threat)
+    features = jax.vmap(jax.vmap(SUB.source.features, (None, 0)))(bodies, hazards.state)
     each = np.asarray(exact(features.reshape(-1, 3), SUB).threat, float).reshape(6, 20, 15)
-    reached = jax.vmap(jax.vmap(SUB.source.in_reach, (None, 0)))(agents, hazards.state)
+    reached = jax.vmap(jax.vmap(SUB.source.in_reach, (None, 0)))(bodies, hazards.state)
     counted = np.asarray(reached & hazards.present)
     assert 0 < counted.sum() < hazards.present.sum()  # some are outside
     assert found.shape == (6, 15)
@@ -95,7 +95,7 @@ def test_labelled_sums_add_the_labels_of_hazards_in_reach(exact):
 
 
 def test_labelled_sums_are_zero_where_there_is_nothing_near():
-    agents, hazards = crowd(1, 4, 5)
+    bodies, hazards = crowd(1, 4, 5)
     gone = hazards._replace(present=jnp.zeros((4, 5), bool))
-    found = labelled_sum(jax.random.key(0), agents, gone, SUB, exact_threat)
+    found = labelled_sum(jax.random.key(0), bodies, gone, SUB, exact_threat)
     np.testing.assert_array_equal(found, np.zeros((4, 15)))

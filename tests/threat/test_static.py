@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from rp_jax import shield
+from rp_jax.dynamics import Vehicle, make_vehicle
 from rp_jax.envs import circuit, jam, tracks
-from rp_jax.kinematics import Vehicle, make_vehicle
 from rp_jax.threat.static import MARGIN, bounded, plan_clearance, static_threat
 
 
@@ -18,16 +18,16 @@ def made(env):
     return env.make_params(baseline="plans")
 
 
-def clearances(env, agent):
+def clearances(env, body):
     params = made(env)
-    return _clearances(env)(agent, params)
+    return _clearances(env)(body, params)
 
 
 @functools.cache
 def _clearances(env):
-    def each(agent, params):
+    def each(body, params):
         room = lambda position: env.clearance(position, params)  # noqa: E731
-        return plan_clearance(agent, params.agent, room)
+        return plan_clearance(body, params.body, room)
 
     return jax.jit(each)
 
@@ -53,7 +53,7 @@ def test_clearance_never_exceeds_the_room_and_comes_close(env):
 @pytest.mark.parametrize("env", [circuit, jam])
 def test_ways_of_plans_are_those_of_a_slow_loop(env):
     params = made(env)
-    model, plans = params.agent, params.agent.baseline
+    model, plans = params.body, params.body.baseline
     start = make_vehicle((0.7, 0.9) if env is jam else (0.5, 0.02), 0.7, 0.06)
     found = np.asarray(clearances(env, start))
     assert found.shape == (len(plans.target), 15)
@@ -106,18 +106,18 @@ def test_who_starts_secure_stays_secure_whatever_it_does(track):
 
     def act(states, t):
         room = lambda position: circuit.clearance(position, params)  # noqa: E731
-        clear = jax.vmap(lambda agent: plan_clearance(agent, params.agent, room))(states.agent)
+        clear = jax.vmap(lambda body: plan_clearance(body, params.body, room))(states.body)
         threat = jnp.min(static_threat(clear), axis=1)
         allowed = jax.vmap(shield.shield, (0, None))(threat, 0.5)
         keys = jax.random.split(jax.random.fold_in(jax.random.key(1), t), rows)
         # Fast ones first: half of the time the admissible action of the greatest acceleration.
         wild = jax.vmap(shield.masked_sample)(keys, allowed.admissible)
         fast = jax.vmap(shield.masked_argmax, (None, 0))(
-            params.agent.actions.acceleration, allowed.admissible
+            params.body.actions.acceleration, allowed.admissible
         )
         action = jnp.where(jnp.arange(rows) % 2 == 0, wild, fast)
         states, outcome = jax.vmap(circuit.step, (0, 0, 0, None))(keys, states, action, params)
-        return states, (outcome.danger, allowed.secure, states.agent.speed)
+        return states, (outcome.danger, allowed.secure, states.body.speed)
 
     start = jax.vmap(circuit.reset, (0, None))(jax.random.split(jax.random.key(0), rows), params)
     _, (danger, secure, speed) = jax.jit(lambda s: jax.lax.scan(act, s, jnp.arange(steps)))(start)
@@ -133,5 +133,5 @@ def test_under_plans_walls_are_no_hazards_of_their_own(env):
     state = env.reset(jax.random.key(0), params)
     assert "wall" not in env.hazards(state, params)
     assert "wall" not in env.sub_rmdps(params)
-    assert "wall" in env.causes(state, params)
-    assert isinstance(state.agent, Vehicle)
+    assert "wall" in env.collisions(state, params)
+    assert isinstance(state.body, Vehicle)

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rp_jax.dynamics import Vehicle
 from rp_jax.envs import jam
-from rp_jax.envs.base import Hazards
-from rp_jax.kinematics import Vehicle
+from rp_jax.envs.contract import Hazards
 from rp_jax.threat.model import ThreatModel, ThreatNetwork
 from rp_jax.threat.total import CHUNK, total_threat
 
@@ -42,9 +42,9 @@ def random_states(seed, count):
             speed=jnp.asarray(rng.uniform(-0.1, 0.1, shape), jnp.float32),
         )
 
-    agents, others = vehicles(count), vehicles(count, 6)
-    walls = jax.jit(jax.vmap(PARAMS.walls_in_reach.near))(agents.position)
-    return agents, {
+    bodies, others = vehicles(count), vehicles(count, 6)
+    walls = jax.jit(jax.vmap(PARAMS.walls_in_reach.near))(bodies.position)
+    return bodies, {
         "wall": Hazards(walls, walls[..., 0] < 100),
         "obstacle": Hazards(others, jnp.asarray(rng.random((count, 6)) < 2 / 3)),
     }
@@ -59,20 +59,20 @@ def some(tree, rows):
     return jax.tree.map(lambda a: a[rows], tree)
 
 
-def terms(models, agents, hazards):
+def terms(models, bodies, hazards):
     """By state, the float32 threats (k, A) of the hazards that count, one kind after another.
 
     Every network call has as many rows as the packed one, so that the terms are the same bits.
     """
-    count = len(agents.speed)
+    count = len(bodies.speed)
     found = [[] for _ in range(count)]
     for kind in sorted(hazards):
         model, group = models[kind], hazards[kind]
         features = jax.jit(jax.vmap(jax.vmap(model.source.features, (None, 0))))
-        features = np.asarray(features(agents, group.state))
+        features = np.asarray(features(bodies, group.state))
         present = np.asarray(group.present)
         reached = jax.jit(jax.vmap(jax.vmap(model.source.in_reach, (None, 0))))
-        reached = np.asarray(reached(agents, group.state))
+        reached = np.asarray(reached(bodies, group.state))
         rows = []
         for i in range(count):
             for n in range(present.shape[1]):
@@ -107,9 +107,9 @@ def test_it_is_the_sum_over_the_hazards_in_reach(batch):
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_it_is_so_for_other_models_and_states(seed):
-    models, (agents, hazards) = random_models(seed), random_states(seed, FEW)
-    expected = [t.astype(float).sum(axis=0) for t in terms(models, agents, hazards)]
-    found = total(models, agents, hazards)
+    models, (bodies, hazards) = random_models(seed), random_states(seed, FEW)
+    expected = [t.astype(float).sum(axis=0) for t in terms(models, bodies, hazards)]
+    found = total(models, bodies, hazards)
     np.testing.assert_allclose(found, np.stack(expected), rtol=2e-5, atol=1e-12)
 
 
@@ -136,34 +136,34 @@ def test_a_row_does_not_depend_on_its_place():
 
 
 def test_absent_hazards_count_nothing():
-    agents, hazards = random_states(4, FEW)
+    bodies, hazards = random_states(4, FEW)
     obstacles, walls = hazards["obstacle"], hazards["wall"]
     gone = {**hazards, "obstacle": obstacles._replace(present=jnp.zeros((FEW, 6), bool))}
-    alone = total({"wall": MODELS["wall"]}, agents, {"wall": walls})
-    np.testing.assert_allclose(total(MODELS, agents, gone), alone, rtol=1e-5)
+    alone = total({"wall": MODELS["wall"]}, bodies, {"wall": walls})
+    np.testing.assert_allclose(total(MODELS, bodies, gone), alone, rtol=1e-5)
     none = {**gone, "wall": walls._replace(present=jnp.zeros_like(walls.present))}
-    np.testing.assert_array_equal(total(MODELS, agents, none), np.zeros((FEW, 15)))
+    np.testing.assert_array_equal(total(MODELS, bodies, none), np.zeros((FEW, 15)))
 
 
 @pytest.mark.parametrize("nowhere", [np.nan, np.inf])
 def test_where_absent_hazards_stand_makes_no_difference(nowhere):
-    agents, hazards = random_states(5, FEW)
+    bodies, hazards = random_states(5, FEW)
     others = hazards["obstacle"]
     away = jnp.where(others.present[..., None], others.state.position, nowhere)
     lost = others._replace(state=others.state.replace(position=away))
     np.testing.assert_array_equal(
-        total(MODELS, agents, {**hazards, "obstacle": lost}), total(MODELS, agents, hazards)
+        total(MODELS, bodies, {**hazards, "obstacle": lost}), total(MODELS, bodies, hazards)
     )
 
 
 def test_hazards_out_of_reach_count_nothing():
     model = {"wall": MODELS["wall"]}
     window = SUBS["wall"].source.window_at(jnp.zeros(()))
-    agent = Vehicle(jnp.zeros((1, 2)), jnp.asarray([[1.0, 0.0]]), jnp.zeros(1))
+    body = Vehicle(jnp.zeros((1, 2)), jnp.asarray([[1.0, 0.0]]), jnp.zeros(1))
 
     def at(x, y):
         place = jnp.asarray([[[x, y]]], jnp.float32)
-        return total(model, agent, {"wall": Hazards(place, jnp.ones((1, 1), bool))})
+        return total(model, body, {"wall": Hazards(place, jnp.ones((1, 1), bool))})
 
     (left, down), (right, up) = np.asarray(window.lower), np.asarray(window.upper)
     rim = ((right, 0.0), (left, 0.0), (0.0, up), (0.0, down), (right, up))
@@ -174,21 +174,21 @@ def test_hazards_out_of_reach_count_nothing():
 
 
 def test_more_hazards_are_never_less_dangerous():
-    agents, hazards = random_states(6, FEW)
+    bodies, hazards = random_states(6, FEW)
     before = np.zeros((FEW, 15))
     for count in range(7):
         present = jnp.broadcast_to(jnp.arange(6) < count, (FEW, 6))
         group = hazards["obstacle"]._replace(present=present)
-        now = np.asarray(total(MODELS, agents, {**hazards, "obstacle": group}))
+        now = np.asarray(total(MODELS, bodies, {**hazards, "obstacle": group}))
         assert (now >= before).all()
         before = now
 
 
 def test_a_kind_without_places_counts_nothing():
-    agents, hazards = random_states(7, FEW)
+    bodies, hazards = random_states(7, FEW)
     empty = Hazards(some(hazards["obstacle"].state, np.s_[:, :0]), jnp.zeros((FEW, 0), bool))
-    alone = total({"wall": MODELS["wall"]}, agents, {"wall": hazards["wall"]})
-    both = total(MODELS, agents, {"wall": hazards["wall"], "obstacle": empty})
+    alone = total({"wall": MODELS["wall"]}, bodies, {"wall": hazards["wall"]})
+    both = total(MODELS, bodies, {"wall": hazards["wall"], "obstacle": empty})
     np.testing.assert_allclose(both, alone, rtol=1e-5)
 
 
@@ -200,10 +200,10 @@ def test_a_missing_model_is_named():
 @pytest.mark.parametrize("models_too", [False, True])
 def test_it_works_under_vmap_over_seeds(models_too):
     seeds = [random_states(seed, FEW) for seed in (8, 9, 10)]
-    agents, hazards = jax.tree.map(lambda *a: jnp.stack(a), *seeds)
+    bodies, hazards = jax.tree.map(lambda *a: jnp.stack(a), *seeds)
     models = [random_models(seed) if models_too else MODELS for seed in (0, 1, 2)]
     given = jax.tree.map(lambda *a: jnp.stack(a), *models) if models_too else MODELS
     axes = (0 if models_too else None, 0, 0)
-    found = jax.jit(jax.vmap(total_threat, axes))(given, agents, hazards)
+    found = jax.jit(jax.vmap(total_threat, axes))(given, bodies, hazards)
     for i in range(3):
         np.testing.assert_allclose(found[i], total(models[i], *seeds[i]), rtol=1e-5, atol=1e-9)

@@ -1,0 +1,1 @@
+"""A drone with momentum among drifting discs."""

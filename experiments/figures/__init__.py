@@ -1,0 +1,1 @@
+"""Figures of the paper's tasks, from finished runs; need matplotlib."""

@@ -1,0 +1,1 @@
+"""The command `rp-jax`, and what command lines of experiments share."""

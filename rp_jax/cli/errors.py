@@ -1,0 +1,88 @@
+"""How commands end: messages and exit codes in place of tracebacks."""
+
+import importlib.util
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from rp_jax import storage
+from rp_jax.cli.terminal import say
+from rp_jax.runs import record
+
+NO_FIGURES = ", or say --no-figures"
+
+
+@contextmanager
+def bad_input() -> Iterator[None]:
+    """Turns a ValueError into a message and exit code 2; numbers that are not finite, into 1."""
+    try:
+        yield
+    except FloatingPointError as error:
+        say(f"error: {error}", style="red")
+        raise SystemExit(1) from None
+    except ValueError as error:
+        say(f"error: {error}", style="red")
+        raise SystemExit(2) from None
+
+
+@contextmanager
+def resumable(again: str, folder: Path, finish: Callable[[], None]) -> Iterator[None]:
+    """Surrounds a run: says how to go on if it is stopped, and exits with 130 or, on errors, 1.
+
+    Exits with 2 if another process is at work on the run. SIGTERM ends it as Ctrl-C does.
+
+    Args:
+        again: the command that goes on.
+        folder: of the run.
+        finish: called when the run is finished.
+    """
+    with ExitStack() as stack:
+        with bad_input():
+            stack.enter_context(storage.locked(folder / record.CHECKPOINTS, record.LOCK))
+        stack.enter_context(_terminated_as_interrupted())
+        storage.sweep(folder)
+        try:
+            yield
+        except KeyboardInterrupt as stop:
+            say(f"interrupted ({stop or 'between two steps'}); to go on: {again}", style="yellow")
+            raise SystemExit(130) from None
+        except (FloatingPointError, OSError, storage.StorageError) as error:
+            say(f"error: {error}; to go on: {again}", style="red")
+            raise SystemExit(1) from None
+        finish()
+
+
+@contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """SIGTERM, which schedulers send, is handed on as SIGINT."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def needs_matplotlib(figures: bool = True, otherwise: str = "") -> None:
+    """Raises ValueError if figures are wanted and cannot be drawn.
+
+    Args:
+        figures: whether they are wanted.
+        otherwise: how to do without, for the message.
+    """
+    if figures and importlib.util.find_spec("matplotlib") is None:
+        raise ValueError(f"figures need matplotlib (pip install 'rp_jax[plot]'){otherwise}")
+
+
+def needs_folder(out: Path | None) -> None:
+    """Raises ValueError if a file that is written at the end could not be.
+
+    Args:
+        out: the file; None: nothing is written.
+    """
+    if out is not None and not out.parent.is_dir():
+        raise ValueError(f"out is {out}; its folder must exist")

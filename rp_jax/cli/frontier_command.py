@@ -1,0 +1,114 @@
+"""Return and crash rate over the threshold x, from one threat function.
+
+Agents for all thresholds learn side by side in one program; beside them agents that are told x.
+Neither learns the threat function again.
+
+rp-jax frontier --env rp_jax.envs.jam --thresholds .001 .01 .1 --set baseline=plans
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+
+from rp_jax import storage
+from rp_jax.cli import errors, experiment, terminal, train_command
+from rp_jax.cli.experiment import Experiment, Run
+from rp_jax.runs import frontier, tables
+from rp_jax.runs.progress import OnProgress
+from rp_jax.runs.train import threat_of
+from rp_jax.validate import number
+
+THRESHOLDS = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
+
+
+def job(run: Run, bar: OnProgress) -> None:
+    """Learns and evaluates for all thresholds; writes frontier.json and the figure.
+
+    Args:
+        run: whose configuration has `thresholds`.
+        bar: of the progress.
+    """
+    config: Any = run.config
+    number("x", config.x, above=0, most=1)
+    frontier.check_thresholds(config.thresholds)
+    key, params = jax.random.key(0), run.world.params()
+    threat = threat_of(key, run.world, config, run.threats, run.folder, run.process, bar)
+    rows = frontier.frontier(
+        key,
+        run.world.env,
+        params,
+        threat,
+        thresholds=config.thresholds,
+        tests={name: run.world.params(name) for name in run.world.tests},
+        seeds=list(range(config.seed, config.seed + config.seeds)),
+        config=config.planning,
+        lookahead=config.lookahead,
+        episodes=config.episodes,
+        penalty=config.penalty,
+        folder=run.folder,
+        devices=run.process.devices,
+        on_progress=bar,
+    )
+    storage.write_json(run.folder / "frontier.json", rows)
+    show(run.world.name, rows)
+    if run.process.figures:
+        from rp_jax.plot import curves
+
+        curves.frontier(rows, run.folder / "frontier.png")
+
+
+def show(name: str, rows: Sequence[dict[str, Any]]) -> None:
+    """Prints one table per test.
+
+    Args:
+        name: of the world.
+        rows: of `frontier`.
+    """
+    for variant in dict.fromkeys(row["variant"] for row in rows):
+        lines = [
+            {
+                "planner": row["planner"],
+                "x": f"{row['x']:g}",
+                "return": tables.earned(row),
+                "crashes": tables.crashed(row),
+                "% [95 %]": tables.percent(row),
+                "insecure": row["insecure"],
+            }
+            for row in rows
+            if row["variant"] == variant
+        ]
+        terminal.table(f"{name} {variant}", lines, list(lines[0]))
+
+
+def main(argv: Sequence[str]) -> None:
+    """Runs the command; exits with 2 on bad input.
+
+    Args:
+        argv: arguments after "frontier".
+    """
+    folder = experiment.to_resume(argv)
+    with errors.bad_input():
+        if folder is not None:
+            world, rest = experiment.world_of(folder), list(argv)
+        else:
+            world, rest = train_command.world_from(argv)
+        base = train_command.config_of(world)
+        kind = dataclasses.make_dataclass(
+            "Config",
+            [("thresholds", tuple[float, ...], dataclasses.field(default=THRESHOLDS))],
+            bases=(type(base),),
+            frozen=True,
+        )
+    experiment.run(
+        Experiment(
+            name="rp-jax frontier",
+            about=__doc__ or "",
+            presets={"default": lambda recipe: kind()},
+            make_world=lambda config: world,
+            job=job,
+            recipes=("tuned",),
+        ),
+        rest,
+    )

@@ -1,0 +1,83 @@
+"""The optional parts of an environment's contract, and their defaults."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from rp_jax.envs.contract import Env
+
+
+def num_actions(env: Env, params: Any) -> int:
+    """Returns the size of the discrete action set.
+
+    Args:
+        env: the environment; by default it has one action for each row of `params.body.actions`.
+        params: the environment's parameters.
+    """
+    if hasattr(env, "num_actions"):
+        return env.num_actions(params)
+    return jax.tree.leaves(params.body.actions)[0].shape[0]
+
+
+def collisions(env: Env, state: Any, params: Any) -> dict[str, Array]:
+    """Returns, by kind, whether a hazard is being hit in a state, () bool each.
+
+    Args:
+        env: the environment; by default the hazards of its `hazards` count, as their source says.
+        state: the state, unbatched.
+        params: the environment's parameters.
+    """
+    if hasattr(env, "collisions"):
+        return env.collisions(state, params)
+    subs, found = env.sub_rmdps(params), {}
+    for kind, group in env.hazards(state, params).items():
+        hit = jax.vmap(subs[kind].source.hits, (None, 0))(state.body, group.state)
+        found[kind] = jnp.any(hit & group.present)
+    return found
+
+
+def clearance(env: Env, position: Array, params: Any) -> Array:
+    """Returns the distance left between the body and the nearest fixed hazard, () room units.
+
+    Args:
+        env: the environment; by default nothing is fixed, and the distance is infinite.
+        position: (2,) of the body.
+        params: the environment's parameters.
+    """
+    if hasattr(env, "clearance"):
+        return env.clearance(position, params)
+    return jnp.full((), jnp.inf, position.dtype)
+
+
+def lidar_bins(env: Env) -> int:
+    """Returns how many of an observation's first values are distances of a LIDAR; 0 by default.
+
+    Args:
+        env: the environment.
+    """
+    return getattr(env, "LIDAR_BINS", 0)
+
+
+def scale(env: Env) -> tuple[float, ...]:
+    """Returns the factors of the observation beside the LIDAR that learners multiply it by.
+
+    Args:
+        env: the environment; by default the factors are 1, and the result is ().
+    """
+    return getattr(env, "SCALE", ())
+
+
+def observation_size(env: Env, params: Any) -> int:
+    """Returns the length of an observation, without computing one.
+
+    Args:
+        env: the environment.
+        params: the environment's parameters.
+    """
+
+    def first(key: Array) -> Array:
+        return env.observe(env.reset(key, params), params)
+
+    return jax.eval_shape(first, jax.random.key(0)).shape[0]

@@ -1,0 +1,143 @@
+"""The same learner without a shield, without one but penalised, and with it, side by side."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax import Array
+
+from rp_jax import evaluation
+from rp_jax.envs.contract import Env
+from rp_jax.planning.loop import LoopConfig
+from rp_jax.planning.percept import Percept
+from rp_jax.runs.agents import Agents
+from rp_jax.runs.evaluate import evaluate
+from rp_jax.runs.plan import make_pmdp, plan
+from rp_jax.runs.progress import OnMetrics, OnProgress, silent
+from rp_jax.runs.tables import Table
+from rp_jax.streams import Stream, key_of
+from rp_jax.threat.function import ThreatFunction
+from rp_jax.validate import number
+
+
+def compare_shields(
+    key: Array,
+    env: Env,
+    params: Any,
+    threat: ThreatFunction,
+    *,
+    x: float,
+    penalty: float,
+    tests: Mapping[str, Any],
+    seeds: int | Sequence[int] = 1,
+    config: LoopConfig | None = None,
+    episodes: int = 10_000,
+    folder: Path | None = None,
+    settings: Mapping[str, Any] | None = None,
+    devices: str = "one",
+    on_progress: OnProgress = silent,
+    on_metrics: OnMetrics = silent,
+) -> tuple[list[Agents], Table]:
+    """Compares acting at random and learning: without a shield, penalised, and with the shield.
+
+    Args:
+        key: of learning and evaluation.
+        env: the world.
+        params: its parameters while learning.
+        threat: its threat function.
+        x: largest admissible threat of the shield; finite.
+        penalty: per unit of danger: taken off the returns, and off the reward of the penalised.
+        tests: by name, parameters while testing.
+        seeds: how many agents of each kind, or their numbers.
+        config: of the learner.
+        episodes: evaluated per test and agent.
+        folder: for curves, agents and checkpoints.
+        settings: keywords of `env.make_params` that made the parameters.
+        devices: "one", "all" or "cluster".
+        on_progress: called with (stage, done, total, note).
+        on_metrics: called with a row of facts per chunk and agent.
+
+    Returns:
+        The agents without and with the shield, and a row per test, method and agent.
+
+    Raises:
+        ValueError: a setting is out of range.
+    """
+    number("x", x, least=0)
+    place = lambda name: None if folder is None else Path(folder) / name  # noqa: E731
+    common: dict[str, Any] = {
+        "seeds": seeds,
+        "config": config,
+        "penalty": penalty,
+        "settings": settings,
+        "devices": devices,
+        "on_progress": on_progress,
+        "on_metrics": on_metrics,
+    }
+    free = plan(
+        key, env, params, learning_penalty=(0.0, penalty), folder=place("unshielded"), **common
+    )
+    held = plan(key, env, params, threat, x=x, folder=folder, **common)
+    rows: list[dict[str, Any]] = []
+    for name, given in tests.items():
+        rows += untrained(
+            key, env, given, threat, x=x, penalty=penalty, episodes=episodes, name=name
+        )
+        for agents, where in ((free, place("unshielded")), (held, folder)):
+            rows += evaluate(
+                key,
+                agents,
+                env,
+                given,
+                episodes=episodes,
+                penalty=penalty,
+                name=name,
+                folder=where,
+                devices=devices,
+                on_progress=on_progress,
+            )
+    return [free, held], Table(rows)
+
+
+def untrained(
+    key: Array,
+    env: Env,
+    params: Any,
+    threat: ThreatFunction,
+    *,
+    x: float,
+    penalty: float,
+    episodes: int,
+    name: str = "",
+) -> list[dict[str, Any]]:
+    """Evaluates acting at random: over all actions alike, and over all admissible actions alike.
+
+    Args:
+        key: of the episodes.
+        env: the world.
+        params: its parameters.
+        threat: its threat function.
+        x: largest admissible threat of the shield.
+        penalty: taken off the returns per unit of danger.
+        episodes: of each.
+        name: of the parameters, for the table.
+
+    Returns:
+        Two rows of facts.
+    """
+
+    def policy(key: Array, percept: Percept) -> tuple[Array, Array]:
+        scores = jax.random.uniform(key, percept.threat.shape)
+        return evaluation.shielded(lambda _: scores)(key, percept)
+
+    own = key_of(key, Stream.UNTRAINED)
+    play = jax.jit(lambda pmdp: evaluation.play_episodes(own, pmdp, policy, episodes))
+    rows = []
+    for method, given in {"random": None, f"random, shield (x={x:g})": threat}.items():
+        found = play(make_pmdp(env, params, given, x=x))
+        evaluation.check(found, method)
+        shown = {"variant": name, "method": method, "seed": 0}
+        shown["x"] = float("inf") if given is None else x
+        rows.append({**shown, **evaluation.summarise(found, penalty)})
+    return rows

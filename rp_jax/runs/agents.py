@@ -1,0 +1,147 @@
+"""Learned agents: what acts, and all that it needs to act."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from flax import struct
+from jax import Array
+
+from rp_jax.dynamics import Plans
+from rp_jax.evaluation import action_values, shielded
+from rp_jax.planning.loop import LoopConfig
+from rp_jax.planning.percept import Percept
+from rp_jax.planning.pmdp import PMDP
+from rp_jax.shield import rounded_down
+from rp_jax.threat.function import ThreatFunction
+
+
+class Member(NamedTuple):
+    """What sets one of several agents that learn side by side apart."""
+
+    seed: int  # its number
+    x: float  # threshold of admissible threat
+    learning_penalty: float  # taken off the reward per unit of danger while learning
+
+
+class Agent(struct.PyTreeNode):
+    """One learned agent: its action values, and the P-MDP that says what it may do."""
+
+    pmdp: PMDP
+    weights: Any  # of the network
+    network: nn.Module = struct.field(pytree_node=False)
+
+    def values(self, percept: Percept) -> Array:
+        """Returns the action values of a batch of percepts, (B, A).
+
+        Args:
+            percept: leading axis (B,), as `look` returns it.
+        """
+        return action_values(self.network, self.weights)(percept)
+
+    def act(self, states: Any) -> Array:
+        """Returns the best admissible action in each state; where there is none, the safest.
+
+        Args:
+            states: of the environment, one or with a leading axis (B,).
+
+        Returns:
+            () or (B,) int.
+        """
+        return _acted(self, states)
+
+    def look(self, states: Any) -> Percept:
+        """Returns what is seen in states, the threat of each action, and which are admissible.
+
+        Args:
+            states: of the environment, with a leading axis (B,).
+        """
+        return _looked(self.pmdp, states)
+
+
+@jax.jit
+def _looked(pmdp: PMDP, states: Any) -> Percept:
+    return pmdp.perceive(states)
+
+
+@jax.jit
+def _acted(agent: Agent, states: Any) -> Array:
+    single = jnp.ndim(states.time) == 0
+    batch = jax.tree.map(lambda a: jnp.asarray(a)[None], states) if single else states
+    action, _ = shielded(agent.values)(jax.random.key(0), agent.pmdp.perceive(batch))
+    return action[0] if single else action
+
+
+@dataclass(frozen=True)
+class Agents(Sequence[Agent]):
+    """Agents that learned side by side; `agents[0]` is the first, `agents[1:]` the others."""
+
+    pmdp: PMDP  # what they learned in, but for their own thresholds and penalties
+    network: nn.Module
+    weights: Any  # leading axis (n,)
+    members: tuple[Member, ...]  # (n,)
+    config: LoopConfig  # of the learner
+    threat: ThreatFunction | None = None  # None: learned without a shield
+    history: list[dict[str, Any]] = field(default_factory=list)  # a row per chunk and agent
+    seconds: dict[str, float] = field(default_factory=dict)  # of compilation and learning
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            members = self.members[index]
+            weights = jax.tree.map(lambda a: a[index], self.weights)
+            return replace(self, members=members, weights=weights)
+        member = self.members[index]
+        weights = jax.tree.map(lambda a: a[index], self.weights)
+        return Agent(with_member(self.pmdp, member), weights, self.network)
+
+    @property
+    def methods(self) -> list[str]:
+        """How each is called in tables, (n,)."""
+        return [method_name(self.pmdp, member) for member in self.members]
+
+
+def with_member(pmdp: PMDP, member: Member) -> PMDP:
+    """Returns a P-MDP with the threshold and the penalty of one agent.
+
+    Args:
+        pmdp: of several.
+        member: one of them.
+    """
+    return pmdp.replace(
+        x=jnp.asarray(rounded_down(member.x), float),
+        penalty=jnp.asarray(member.learning_penalty, float),
+    )
+
+
+def side_by_side(pmdp: PMDP, members: Sequence[Member]) -> tuple[PMDP, PMDP]:
+    """Returns the P-MDPs of several agents in one, and the `in_axes` of a vmap over them.
+
+    Args:
+        pmdp: with a threshold and a penalty of one agent.
+        members: (n,) whose thresholds and penalties replace these.
+    """
+    x = jnp.asarray(rounded_down([member.x for member in members]), float)
+    penalty = jnp.asarray([member.learning_penalty for member in members], float)
+    axes = pmdp.replace(params=None, threats=None, x=0, penalty=0, insecure_penalty=None)
+    return pmdp.replace(x=x, penalty=penalty), axes
+
+
+def method_name(pmdp: PMDP, member: Member) -> str:
+    """Returns what an agent is called in tables: RP with its threshold, or DQN with its penalty.
+
+    Args:
+        pmdp: what it learned in.
+        member: the agent.
+    """
+    penalty = member.learning_penalty
+    if not pmdp.shielded or member.x == float("inf"):
+        return f"DQN (penalty {penalty:g})"
+    plans = ", plans" if isinstance(pmdp.params.body.baseline, Plans) else ""
+    extra = "" if penalty == 0 else f", {penalty:g}"
+    return f"RP{plans} (x={member.x:g}{extra})"
