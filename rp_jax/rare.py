@@ -64,7 +64,7 @@ def from_starts(states: Any, pmdp: PMDP) -> Paths:
     """
     count = states.time.shape[0]
     no = jnp.zeros(count, bool)
-    zero = jnp.zeros(count, pmdp.x.dtype)
+    zero = jnp.zeros(count)
     return Paths(states, states, zero, no, no, jnp.zeros(count, jnp.int32), no)
 
 
@@ -154,7 +154,7 @@ def risks(key: Array, states: Any, actions: Array, pmdp: PMDP, values: Values, t
     crashed = outcome.danger > 0
     over = crashed | outcome.done
     paths = from_starts(reached, pmdp)._replace(crashed=over)  # marked paths stay where they are
-    found = advance(onward, paths, pmdp, values, jnp.asarray(jnp.inf, pmdp.x.dtype)).crashed
+    found = advance(onward, paths, pmdp, values, jnp.asarray(jnp.inf)).crashed
     return jnp.mean(jnp.where(over, crashed, found).reshape(*actions.shape, tries), axis=-1)
 
 
@@ -226,7 +226,7 @@ def compiled(values: Values) -> Callable[..., Paths]:
     stage = jax.jit(lambda key, paths, pmdp, level: advance(key, paths, pmdp, values, level))
 
     def checked(key: Array, paths: Paths, pmdp: PMDP, level: float) -> Paths:
-        found = stage(key, paths, pmdp, jnp.asarray(level, pmdp.x.dtype))
+        found = stage(key, paths, pmdp, jnp.asarray(level, float))
         if count := int(found.bad.sum()):
             raise FloatingPointError(
                 f"rare: observations or threats of {count:,} paths are nan or infinite"

@@ -1,5 +1,7 @@
 import ast
+import collections
 import functools
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,21 +12,49 @@ ROOT = Path(__file__).parents[1]
 OUTER = ("rp_jax.adapters", "rp_jax.plot")  # the only ones that import libraries for show
 FOREIGN = ("brax", "matplotlib", "gymnasium")
 
-# From the left to the right, as data flow: each imports only from parts to its left, and parts of
-# one place in the line not from one another.
-ORDER = [
-    {"validate", "storage", "devices", "arrays"},
-    {"dynamics"},
-    {"statistics", "shield", "checkpoints"},
-    {"hazards"},
-    {"envs"},
-    {"recon"},
-    {"threat"},
-    {"planning", "tabular"},
-    {"evaluate", "rare", "baselines"},
-    {"plot", "adapters"},
-]
-PLACE = {part: i for i, parts in enumerate(ORDER) for part in parts}
+
+def linted(folder):
+    """(whether all contracts of pyproject.toml are kept, what is said) of the library there."""
+    command = [Path(sys.executable).with_name("lint-imports"), "--no-cache", "--no-logo"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder, check=False)
+    return done.returncode == 0, done.stdout + done.stderr
+
+
+def test_every_part_imports_only_what_it_may():
+    kept, said = linted(ROOT)
+    assert kept, said
+    assert "0 broken" in said
+
+
+WRONG = {
+    # name: (module, line added to it, contract)
+    "a layer above": ("hazards/bomb.py", "from rp_jax.envs import jam", "below it"),
+    "a layer above, later": ("shield.py", "def f():\n    import rp_jax.planning.loop", "below it"),
+    "a sibling": ("plot/maps.py", "from rp_jax.adapters import gymnasium", "below it"),
+    "the core, of the rim": ("rollout.py", "import rp_jax.adapters.registry", "below it"),
+    "a simulator": ("envs/jam.py", "from brax import envs", "at the rim"),
+    "an adapter's library": ("plot/maps.py", "import gymnasium", "at the rim"),
+    "figures": ("evaluation.py", "import matplotlib.pyplot as plt", "at the rim"),
+    "the terminal": ("planning/loop.py", "from rich.console import Console", "at the rim"),
+    "an experiment": ("rare.py", "from experiments import jam", "built on it"),
+    "a test": ("rare.py", "import tests.probe", "built on it"),
+    "a part without a place": ("other.py", '"""Anything."""', "below it"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_import_would_be_noticed(name, tmp_path):
+    module, line, contract = WRONG[name]
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    skip = shutil.ignore_patterns("__pycache__", "*.npz")
+    shutil.copytree(ROOT / "rp_jax", tmp_path / "rp_jax", ignore=skip)
+    with (tmp_path / "rp_jax" / module).open("a") as file:
+        file.write(f"\n{line}\n")
+    kept, said = linted(tmp_path)
+    assert not kept
+    broken = [line for line in said.splitlines() if " BROKEN" in line]
+    assert len(broken) == 1, said
+    assert contract in broken[0], said
 
 
 @functools.cache
@@ -38,9 +68,17 @@ def modules(package="rp_jax"):
     return found
 
 
+def running(tree):
+    """The nodes of a module but for what only type checkers read."""
+    for node in ast.iter_child_nodes(tree):
+        if not (isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")):
+            yield node
+            yield from running(node)
+
+
 def imports(tree):
     """The dotted names that a module imports, anywhere in it."""
-    for node in ast.walk(tree):
+    for node in running(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -48,54 +86,15 @@ def imports(tree):
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def part_of(name):
-    """The file or folder of rp_jax that a dotted name belongs to, if any."""
-    parts = name.split(".")
-    return parts[1] if parts[0] == "rp_jax" and len(parts) > 1 else None
-
-
 def belongs(name, package):
     return name == package or name.startswith(f"{package}.")
 
 
-def test_every_part_has_its_place():
-    assert len(modules()) > 20
-    assert {part_of(name) for name in modules()} - {None} <= set(PLACE)
-
-
-@pytest.mark.parametrize("name", modules())
-def test_a_part_imports_only_from_its_left(name):
-    here = part_of(name)
-    for imported in imports(modules()[name]):
-        there = part_of(imported)
-        if there is None or there == here:
-            continue
-        assert there in PLACE, f"{name} imports {imported}, which has no place"
-        assert here is not None, f"{name} imports {imported}; the package itself imports nothing"
-        assert PLACE[there] < PLACE[here], f"{name} imports {imported}, which is to its right"
-
-
-def test_the_line_would_notice_a_wrong_import():
-    wrong = ast.parse(
-        "def f():\n    from rp_jax.planning import loop\n    import rp_jax.evaluate\n"
-    )
-    assert [part_of(name) for name in imports(wrong)] == ["planning", "evaluate"]
-    assert PLACE["planning"] > PLACE["threat"] > PLACE["envs"] > PLACE["hazards"]
-
-
-@pytest.mark.parametrize("name", modules())
-def test_libraries_for_show_are_imported_at_the_rim_only(name):
-    if not name.startswith(OUTER):
-        used = {imported.split(".")[0] for imported in imports(modules()[name])}
-        assert used.isdisjoint({*FOREIGN, "experiments", "benchmarks", "rich", "tyro", "mujoco"})
-
-
-@pytest.mark.parametrize("package", ["rp_jax", "experiments", "examples", "benchmarks"])
+@pytest.mark.parametrize("package", ["experiments", "examples", "benchmarks"])
 def test_nothing_imports_what_stands_above_it(package):
-    above = {
-        "rp_jax": {"experiments", "examples", "benchmarks"},
-        "experiments": {"examples", "benchmarks"},
-    }
+    """Of the library, the linter tells."""
+    above = {"experiments": {"examples", "benchmarks"}}
+    assert len(modules(package)) > 3
     for name, tree in modules(package).items():
         used = {imported.split(".")[0] for imported in imports(tree)}
         assert used.isdisjoint({"tests", *above.get(package, ())}), name
@@ -182,6 +181,45 @@ def test_there_are_no_cycles(part):
                 todo.append(target)
 
 
+def names_twice(found):
+    """Names that more than one of the (name, module) pairs has, with these modules."""
+    homes = collections.defaultdict(list)
+    for name, module in found:
+        homes[name].append(module)
+    return {name: homes[name] for name in homes if len(homes[name]) > 1}
+
+
+def public_classes(tree):
+    classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
+    return [name for name in classes if not name.startswith("_")]
+
+
+# Names that are still taken twice; none may be added.
+TWICE = {"contract", "model", "tabular", "threat"}
+CLASSES_TWICE = {
+    *("Certificate", "Config", "Draws", "Env", "Learner", "Metrics", "Seen", "Shielded", "World"),
+}
+OF_EACH_ENVIRONMENT = {"State", "Params"}
+
+
+def test_no_two_modules_have_the_same_name():
+    found = names_twice((name.rpartition(".")[2], name) for name in modules())
+    assert {name: homes for name, homes in found.items() if name not in TWICE} == {}
+
+
+def test_no_two_public_classes_have_the_same_name():
+    pairs = [(name, home) for home, tree in modules().items() for name in public_classes(tree)]
+    allowed = CLASSES_TWICE | OF_EACH_ENVIRONMENT
+    found = names_twice(pairs)
+    assert {name: homes for name, homes in found.items() if name not in allowed} == {}
+
+
+def test_a_name_that_is_taken_would_be_noticed():
+    pairs = [("report", "a.report"), ("fit", "a.fit"), ("report", "b.report")]
+    assert names_twice(pairs) == {"report": ["a.report", "b.report"]}
+    assert public_classes(ast.parse("class A: ...\nclass _B: ...\ndef c(): ...")) == ["A"]
+
+
 def undocumented(tree):
     """Names of public modules, classes and functions without a docstring; methods too."""
 
@@ -227,7 +265,7 @@ FORBIDDEN = ("PRNGKey", "np.random", "numpy.random", "jax.random.PRNGKey", "jax.
 
 def offences(tree):
     names = [*attributes(tree), *imports(tree)]
-    found = [n for n in names if any(f".{bad}" in f".{n}" for bad in FORBIDDEN)]
+    found = [n for n in names if any(f".{bad}." in f".{n}." for bad in FORBIDDEN)]
     modules = ("pickle", "cloudpickle", "dill", "joblib", "random", "shelve")
     return found + [n for n in imports(tree) if n.split(".")[0] in modules]
 
@@ -247,6 +285,7 @@ def test_no_old_keys_no_hidden_randomness_no_pickles(name):
         "from numpy import random",
         "import pickle",
         "import random",
+        "jax.debug.print('x')",
     ],
 )
 def test_an_offence_would_be_noticed(line):

@@ -194,8 +194,8 @@ def init(key: Array, pmdp: PMDP, config: ActorCriticConfig) -> State:
     states = jax.vmap(pmdp.env.reset, (0, None))(resets, pmdp.params)
     encoded = pmdp.perceive(states).encoded
     critic = make_critic(pmdp).init(critic_key, encoded, elapsed_of(states, pmdp))
-    nothing = jnp.zeros(config.num_envs, pmdp.x.dtype)
-    zero = jnp.zeros_like(pmdp.x)
+    nothing = jnp.zeros(config.num_envs)
+    zero = jnp.zeros(())
     return State(
         states=states,
         running=tally.Running(nothing, nothing),

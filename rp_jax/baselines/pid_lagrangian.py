@@ -152,7 +152,7 @@ def init(key: Array, pmdp: PMDP, config: PIDConfig) -> State:
         config: hyperparameters.
     """
     learner = actor_critic.init(key, pmdp, config.rollout)
-    nothing = jnp.zeros_like(pmdp.x)
+    nothing = jnp.zeros(())
     opt = optax.adam(config.learning_rate).init(learner.actor)
     return State(learner, opt, Controller(nothing, nothing))
 

@@ -133,6 +133,6 @@ def identity(folder: Path) -> str:
     agents = storage.read_manifest(folder / saved.AGENTS, saved.KIND)
     digest.update(agents["sha256"].encode())
     threat = folder / saved.THREAT
-    if threat.is_dir():
+    if (threat / "manifest.json").exists():
         digest.update(storage.read_manifest(threat, artefact.KIND)["sha256"].encode())
     return digest.hexdigest()

@@ -99,7 +99,7 @@ class PMDP(struct.PyTreeNode):
         """
         if not self.shielded:
             shape = (states.time.shape[0], self.num_actions)
-            return jnp.zeros(shape, self.x.dtype)
+            return jnp.zeros(shape)
         summed = self._summed(states, self._static(states.body), alive)
         if self.lookahead == 0:
             return summed

@@ -84,7 +84,7 @@ def load(folder: str | Path, env: Env | None = None, params: Any = None) -> Any:
         params = _parameters(folder, world, about)
     threat = None
     if about.get("shielded", True):
-        threat = load_threat(folder / THREAT, world.sub_rmdps(params))
+        threat = _threat(folder / THREAT, world.sub_rmdps(params))
     config = restored(LoopConfig, about.get("config"), f"{folder}: config")
     pmdp = PMDP(
         params=params,
@@ -98,6 +98,13 @@ def load(folder: str | Path, env: Env | None = None, params: Any = None) -> Any:
         shielded=threat is not None,
     )
     return restored_agents(folder, about, pmdp, threat)
+
+
+def _threat(folder: Path, subs: Mapping[str, Any]) -> ThreatFunction:
+    """The threat function of a run; one without models may not have been kept."""
+    if not subs and not folder.is_dir():
+        return ThreatFunction({}, {})
+    return load_threat(folder, subs)
 
 
 def imported(name: Any) -> Any:

@@ -251,7 +251,7 @@ def test_one_of_the_best_is_drawn_and_no_other():
 
 
 def percept(states, alive):
-    return mpc.Percept(mpc.Seen(states, alive), None, None, None)
+    return mpc.Percept(mpc.Seen(states, alive), None, None, None, None)
 
 
 def test_parameters_and_penalties_need_no_new_program():

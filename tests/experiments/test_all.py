@@ -1,5 +1,6 @@
 """The command that makes all results: what it runs, skips, resumes and reports."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -14,14 +15,19 @@ import pytest
 from stubs import picture
 from tiny import programs_of_a_moment  # noqa: F401
 
+import rp_jax
 from experiments import all as everything
-from experiments import report, settings
+from experiments import report
 from experiments.paper import commands, fig6, timing, walls
 from experiments.paper import sources as module
 from experiments.paper.section import Claim, Section, Table
 from rp_jax import storage
 from rp_jax.envs import circuit
 from rp_jax.envs.tracks import circle_plan
+from rp_jax.runs import record
+from rp_jax.runs.evaluate import Timing
+
+JAM = "python -m experiments.jam"
 
 
 class Runs:
@@ -42,10 +48,9 @@ class Runs:
         self.stops.discard(folder.name)
         status = 130 if stops else self.exits.get(folder.name, 0)
         if status != 2:  # which is bad input, before anything is written
-            storage.write_json(
-                folder / "config.json", {"experiment": command[2]} | settings.machine(command[2])
-            )
-        checkpoints = folder / settings.CHECKPOINTS
+            facts = {"experiment": " ".join(command[:3]), **record.machine(None)}
+            storage.write_json(folder / "config.json", facts)
+        checkpoints = folder / record.CHECKPOINTS
         if stops:
             checkpoints.mkdir()
         elif checkpoints.exists():
@@ -86,7 +91,7 @@ def test_an_interrupted_run_of_other_code_begins_anew(runs, tmp_path, monkeypatc
     runs.stops.add("jam")
     with pytest.raises(KeyboardInterrupt):
         module.Sources(tmp_path, "quick")("jam")
-    monkeypatch.setattr(settings, "code", lambda experiment: "other")
+    monkeypatch.setattr(record, "code_of", lambda folder: "other")
     module.Sources(tmp_path, "quick")("jam")
     assert "--resume" not in runs.commands[1]
 
@@ -107,7 +112,7 @@ def test_a_failed_run_is_not_tried_twice_and_begins_anew_later(runs, tmp_path):
 
 def test_a_run_that_ended_after_its_parent_is_finished(runs, tmp_path):
     (tmp_path / "jam").mkdir()
-    storage.write_json(tmp_path / "jam" / "config.json", {"experiment": "experiments.jam"})
+    storage.write_json(tmp_path / "jam" / "config.json", {"experiment": JAM})
     module.Sources(tmp_path, "quick")("jam")
     assert runs.commands == []
 
@@ -116,7 +121,7 @@ def test_an_interrupted_run_that_was_resumed_by_itself_is_finished(runs, tmp_pat
     runs.stops.add("jam")
     with pytest.raises(KeyboardInterrupt):
         module.Sources(tmp_path, "quick")("jam")
-    (tmp_path / "jam" / settings.CHECKPOINTS).rmdir()  # as experiments.jam --resume leaves it
+    (tmp_path / "jam" / record.CHECKPOINTS).rmdir()  # as experiments.jam --resume leaves it
     (tmp_path / "jam" / "table.json").touch()
     module.Sources(tmp_path, "quick")("jam")
     assert len(runs.commands) == 1
@@ -248,8 +253,8 @@ def test_bad_input_is_named(words, message, tmp_path, monkeypatch, capsys):
 
 
 def test_another_experiments_folder_is_refused(tmp_path):
-    storage.write_json(tmp_path / "config.json", {"experiment": "experiments.jam"})
-    with pytest.raises(ValueError, match=r"must be a folder of experiments\.all$"):
+    storage.write_json(tmp_path / "config.json", {"experiment": JAM})
+    with pytest.raises(ValueError, match=r"must be a folder of python -m experiments\.all$"):
         everything.begun(everything.Config(resume=tmp_path))
 
 
@@ -278,7 +283,10 @@ def circuit_runs(finished, tmp_path):
     """What fig6, timing and walls load: the tiny run of Circuit, also as that of DQN."""
     shutil.copytree(finished, tmp_path / "circuit_lost")
     picture(tmp_path / "circuit_lost" / "animation.gif")
-    shutil.copytree(finished / "agent", tmp_path / "dqn_circuit" / "dqn" / "agent")
+    agents = rp_jax.load(finished)
+    free = agents.pmdp.replace(threats={}, shielded=False)
+    free = dataclasses.replace(agents, pmdp=free, threat=None)
+    rp_jax.save(tmp_path / "dqn_circuit" / "dqn", free, {"track": "circle"})
     return lambda name: tmp_path / name
 
 
@@ -306,7 +314,8 @@ def test_all_methods_are_timed_in_one_process(circuit_runs, tmp_path, monkeypatc
     monkeypatch.setitem(timing.LEARNED_ON, "circuit", "circle")
     monkeypatch.setattr(timing, "ROUNDS", 1)
     monkeypatch.setattr(timing, "TIMED", {"circuit": {"RP": "circuit_lost"}})
-    monkeypatch.setattr(timing.mpc, "action_seconds", lambda key, search: (search.horizon, 0.0))
+    timed = lambda key, search: Timing(search.horizon, 0.0)  # noqa: E731
+    monkeypatch.setattr(timing, "time_search", timed)
     results = timing.run(circuit_runs, tmp_path)
     found = {row["method"]: row["seconds"] for row in results["actions"]}
     assert list(found) == ["RP", "DQN", "CPO", "MPC (1 steps)", "MPC (4 steps)"]

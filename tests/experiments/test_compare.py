@@ -2,16 +2,17 @@
 
 import dataclasses
 import json
-import sys
 
 import pytest
 from tiny import programs_of_a_moment  # noqa: F401
 
-from experiments import compare, settings
+from experiments import compare
 from rp_jax import storage
 from rp_jax.baselines.actor_critic import ActorCriticConfig
 from rp_jax.baselines.cpo import CPOConfig
 from rp_jax.baselines.pid_lagrangian import PIDConfig
+from rp_jax.cli import experiment
+from rp_jax.runs import policy_gradient, record
 
 SMALL = {"num-envs": 8, "length": 16, "epochs": 1, "minibatches": 2}
 
@@ -20,13 +21,12 @@ SMALL = {"num-envs": 8, "length": 16, "epochs": 1, "minibatches": 2}
 def test_every_method_has_its_rows(finished, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(compare.SETTINGS, "circuit", ((0.0, 20.0), 1e-3, 1))
     out = tmp_path / "compare"
-    words = "compare --env circuit --steps 6000 --episodes 8 --mpc-episodes 2"
+    words = "--env circuit --steps 6000 --episodes 8 --mpc-episodes 2"
     for method in ("cpo", "pid"):
         for name, value in SMALL.items():
             words += f" --{method}.rollout.{name} {value}"
     files = ["--threat", str(finished / "threat"), "--out", str(out)]
-    monkeypatch.setattr(sys, "argv", [*words.split(), *files])
-    compare.main()
+    compare.main(compare.COMMAND, [*words.split(), *files])
     rows = json.loads((out / "compare.json").read_text())
     methods = list(dict.fromkeys(row["method"] for row in rows))
     assert methods == [
@@ -47,7 +47,7 @@ def test_every_method_has_its_rows(finished, tmp_path, monkeypatch, capsys):
         text = (out / name / "metrics.jsonl").read_text()
         history = [json.loads(line) for line in text.splitlines()]
         dqn = json.loads((out / "dqn" / "metrics.jsonl").read_text().splitlines()[0])
-        kept = storage.read_manifest(out / name / "agent", "actor")["about"]
+        kept = storage.read_manifest(out / name / "agent", policy_gradient.KIND)["about"]
         assert (kept["method"], len(kept["members"])) == (method, 1)
         own = {"cpo": {"kl", "recoveries", "accepted"}, "pid": {"multiplier"}}[name]
         assert set(history[0]) == set(dqn) - {"insecure", "inadmissible", "loss"} | own
@@ -67,20 +67,48 @@ def test_every_method_has_its_rows(finished, tmp_path, monkeypatch, capsys):
         assert f"circuit {variant}" in shown
 
 
-def test_an_interrupted_comparison_goes_on(tmp_path, monkeypatch):
-    config = compare.Config("jam", methods=("PID",), steps=6000, out=tmp_path)
-    settings.begin(tmp_path, "experiments.compare", dataclasses.asdict(config))
-    went_on = []
-    monkeypatch.setattr(compare, "run", lambda *of: went_on.append(of) or [])
+def test_an_interrupted_comparison_goes_on_with_the_methods_that_are_left(tmp_path, monkeypatch):
+    made, left = [], []
+
+    def maker(method, stops):
+        def make(config, run, folder, bar):
+            made.append(method)
+            if stops and not left:
+                left.append(method)
+                raise KeyboardInterrupt
+            assert folder == run.folder / method.lower()
+            return [{"env": "jam", "variant": "N=3", "method": method, "x": float("inf")}]
+
+        return make
+
+    makers = {method: maker(method, method == "PID") for method in compare.METHODS}
+    monkeypatch.setattr(compare, "MAKERS", makers)
     monkeypatch.setattr(compare, "show", lambda rows: None)
-    monkeypatch.setattr(sys, "argv", ["compare", "--resume", str(tmp_path)])
-    compare.main()
-    ((found, own, task, folder, checkpoints),) = went_on
+    out = tmp_path / "new"
+    words = ["--env", "jam", "--methods", "MPC", "PID", "CPO", "--steps", "6000"]
+    with pytest.raises(SystemExit, match="130"):
+        compare.main(compare.COMMAND, [*words, "--out", str(out)])
+    assert made == ["CPO", "PID"]
+    compare.main(compare.COMMAND, ["--resume", str(out)])
+    assert made == ["CPO", "PID", "PID", "MPC"]
+    rows = json.loads((out / "compare.json").read_text())
+    assert [row["method"] for row in rows] == ["CPO", "PID", "MPC"]
+    assert rows[0]["x"] == "inf"
+    assert not (out / record.CHECKPOINTS).exists()
+
+
+def test_settings_come_back_from_the_file(tmp_path, monkeypatch):
+    config = compare.Config("jam", methods=("PID",), steps=6000, out=tmp_path)
+    facts = {"experiment": compare.COMMAND.name, **dataclasses.asdict(config)}
+    experiment.begin(tmp_path, {**facts, **record.machine(None)})
+    went_on = []
+    command = compare.COMMAND._replace(job=lambda *of: went_on.append(of))
+    compare.main(command, ["--resume", str(tmp_path)])
+    ((found, run, folder),) = went_on
     assert found == config
-    assert own == compare.settings_of(config)
-    assert task.name == "jam"
+    assert run.config == compare.settings_of(config)
+    assert run.world.name == "jam"
     assert folder == tmp_path
-    assert checkpoints.folder.parent == tmp_path
 
 
 @pytest.mark.parametrize(

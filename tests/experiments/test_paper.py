@@ -12,7 +12,7 @@ from stubs import RP, Stub, evaluated
 from tiny import programs_of_a_moment  # noqa: F401
 
 from experiments import all as everything
-from experiments import compare, tasks
+from experiments import compare
 from experiments.paper import (
     brief,
     commands,
@@ -26,8 +26,9 @@ from experiments.paper import (
     walls,
 )
 from experiments.paper import training_crashes as crashes
-from experiments.runs import EXPERIMENTS
+from experiments.tasks import EXPERIMENTS
 from rp_jax import storage
+from rp_jax.cli import experiment
 from rp_jax.evaluation import Episodes, summarise
 
 PLAIN = [
@@ -181,7 +182,7 @@ def test_another_penalty_gives_what_it_would_have_given_at_once(rate):
 
 
 def test_the_heavier_tables_of_the_paper_follow_from_the_lighter_ones():
-    for env, (_, _, penalty) in tables3_4.TABLES.items():
+    for env, (_, penalty) in tables3_4.TABLES.items():
         more = published.HEAVIER[env] - penalty
         for variant, methods in published.SCORES[env].items():
             for method, (earned, rate) in methods.items():
@@ -227,25 +228,25 @@ def parsed(name, preset):
     """The configuration of a run, checked as its experiment does it."""
     module_name, *rest = commands.words(name, preset)
     module = importlib.import_module(f"experiments.{module_name}")
-    if not hasattr(module, "Config") or not issubclass(module.Config, tasks.Config):
-        if module_name != "patrol":
-            config = tyro.cli(module.Config, args=rest)
-            if module_name == "compare":
-                compare.settings_of(config)
-            elif module_name == "mpc":
-                assert config.env in EXPERIMENTS
-            else:
-                config.validate()
-            return config
-        module = importlib.import_module("experiments.jam")
+    if not hasattr(module, "EXPERIMENT"):
+        config = tyro.cli(module.Config, args=rest)
+        if module_name == "compare":
+            compare.settings_of(config)
+        elif module_name == "mpc":
+            assert config.env in EXPERIMENTS
+        else:
+            config.validate()
+        return config
     given = dict(itertools.pairwise(rest))
-    base = module.PRESETS[given.get("--preset", "quick")](given.get("--recipe", "tuned"))
+    own = module.EXPERIMENT
+    base = own.presets[given.get("--preset", "quick")](given.get("--recipe", "tuned"))
     for word in ("--preset", "--recipe"):
         if word in rest:
             at = rest.index(word)
             del rest[at : at + 2]
-    config = tyro.cli(type(base), default=base, args=rest)
+    config, _ = experiment.parsed(base, rest, own.name, own.about)
     config.validate()
+    assert own.make_world(config).tests
     return config
 
 
@@ -277,7 +278,7 @@ def test_one_switch_differs_from_the_first_table():
     }.items():
         changed = dataclasses.asdict(parsed(name, "full"))
         found = {key for key, value in changed.items() if value != reference[key]}
-        assert found - {"seeds", "episodes", "threat", "test_obstacles", "figures"} == switched
+        assert found - {"seeds", "episodes", "test_obstacles"} == switched
 
 
 def test_sums_over_walls_are_compared_with_the_joint_threat():

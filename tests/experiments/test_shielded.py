@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from quick import unoptimised
 
-from experiments import shielded, tasks
+from experiments import shielded
 from rp_jax.envs import jam
+from rp_jax.runs.plan import make_pmdp
+from rp_jax.threat.function import ThreatFunction
 
 TINY = "--{0}.states 200 --{0}.paths 4 --{0}.test-states 200 --{0}.test-paths 8 " + (
     "--{0}.fit.steps 40 --{0}.fit.batch 64 --{0}.fit.hidden 16"
@@ -61,9 +63,7 @@ def test_every_policy_is_played_without_the_shield_and_with_it(tmp_path, monkeyp
 def test_a_perfect_threat_of_walls_keeps_a_policy_off_them(monkeypatch):
     params = jam.make_params(3, baseline="plans")
     policy = full_speed(jam, params, None)
-    settings = shielded.Config(baseline="plans", obstacles=3, x=0.5).for_pipeline()
-    task = shielded.jam.make_task(settings)
-    pmdp = tasks.make_pmdp(task, settings, {}, params).replace(env=WallsOnly)
+    pmdp = make_pmdp(WallsOnly, params, ThreatFunction({}, {}), x=0.5)
     monkeypatch.setattr(shielded, "ROUND", 50)
     play = jax.jit(lambda key: shielded.played(key, pmdp, policy.weights, policy, True))
     rows = play(jax.random.key(0))
@@ -80,6 +80,10 @@ class WallsOnly:
 
     @staticmethod
     def hazards(state, params):
+        return {}
+
+    @staticmethod
+    def sub_rmdps(params):
         return {}
 
 

@@ -50,9 +50,8 @@ def contract_problems(env: Any, params: Any) -> list[str]:
     found = _state_problems(state) + _limit_problems(params)
     if not hasattr(state, "body"):
         return found
-    found += body_problems(params.body, state.body)
-    if not found:
-        found += _action_problems(env, params)
+    of_body = body_problems(params.body, state.body)
+    found += of_body if of_body else _action_problems(env, params)
     found += _step_problems(env, params, key, state) + _observation_problems(env, params, state)
     return found + _hazard_problems(env, params, state)
 

@@ -66,23 +66,26 @@ def _actions_differ(
     trial: Trial, name: str, pairs: Pairs, pair: Any, other: Any, tolerance: np.ndarray
 ) -> list[str]:
     """The body moves, the hazard is held."""
-    count = trial.num_actions
-    images = np.asarray(trial.model.mirrored_threats())[:count] % count
-    actions = trial.draws.integers(PAIRS, count)
+    images = np.asarray(trial.model.mirrored_threats())
+    index, count = trial.draws.integers(PAIRS, len(images)), trial.num_actions
+    (plans, actions), (their_plans, theirs) = (
+        (i // count, (i % count).astype(np.int32)) for i in (index, images[index])
+    )
     bad, (body, twin) = np.zeros(PAIRS, bool), (pair[0], other[0])
-    for _ in range(STEPS):
-        body = trial.away(body, actions)
-        twin = trial.away(twin, images[actions].astype(np.int32))
+    for k in range(STEPS):
+        follow = k - 1 if trial.plans else -1  # the plan, after the first action
+        choice, their_choice = ((i + 0.5) / (len(images) // count) for i in (plans, their_plans))
+        body = trial.away(body, actions, follow, choice)
+        twin = trial.away(twin, theirs, follow, their_choice)
         got, wanted = pairs.features(twin, other[1]), pairs.mirror(pairs.features(body, pair[1]))
         bad |= beyond(got, wanted, 5 * tolerance)
     if bad.mean() <= 10 * RARE:
         return []
-    wrong = np.bincount(actions[bad], minlength=count)
-    action = int(np.argmax(wrong))
+    worst = int(np.argmax(np.bincount(index[bad], minlength=len(images))))
     return [
         f"mirrored of {name} and params.body.mirrored_threats do not fit together in "
-        f"{number_of(int(bad.sum()), PAIRS, 'pairs')}, most with action {action}, whose mirror "
-        f"image is said to be {images[action]}: from mirrored situations, mirrored actions must "
+        f"{number_of(int(bad.sum()), PAIRS, 'pairs')}, most with index {worst}, whose mirror "
+        f"image is said to be {images[worst]}: from mirrored situations, mirrored actions must "
         "lead to mirrored features"
     ]
 

@@ -1,24 +1,16 @@
-"""Training runs in chunks, with a learner that only counts."""
+"""Learning in chunks, with a learner that only counts."""
 
 import json
 
-import jax
 import numpy as np
-import probe
 import pytest
-from quick import compile_soon, stopped_after  # noqa: F401
 
-from experiments import console, policy_gradient, tasks, training
-from rp_jax.baselines.actor_critic import ActorCriticConfig
-from rp_jax.baselines.cpo import CPOConfig
-from rp_jax.baselines.pid_lagrangian import PIDConfig
 from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints, chunks_of
-from rp_jax.planning.loop import LoopConfig
+from rp_jax.runs import training
+from rp_jax.runs.agents import Member
 
 COUNTED = ("steps", "episodes", "score", "danger", "crashes", "goals")
-
-
-MEMBERS = [training.Member(3, 0.1, 0.0), training.Member(4, 0.1, 0.0)]
+MEMBERS = [Member(3, 0.1, 0.0), Member(4, 0.1, 0.0)]
 
 
 @pytest.mark.parametrize("units", [1, 7, 30, 31, 1000])
@@ -28,7 +20,7 @@ def test_chunks_hold_all_units_and_few_more(units):
     assert units <= chunks * length < units + length
 
 
-def learn(folder, checkpoints=NO_CHECKPOINTS, chunks=4, fails_at=None):
+def learn(folder, checkpoints=NO_CHECKPOINTS, chunks=4, fails_at=None, **told):
     """Member i has i episodes a chunk, each of 10 points and half a crash."""
     each = np.asarray([0.0, 1.0], np.float32)
     blank = {name: np.zeros((chunks, 2), np.float32) for name in COUNTED}
@@ -42,12 +34,10 @@ def learn(folder, checkpoints=NO_CHECKPOINTS, chunks=4, fails_at=None):
         if weights == fails_at:
             raise FloatingPointError(f"chunk {fails_at}")
 
-    learners = training.Learners(
-        MEMBERS, ["a", "b"], 4.0, folder, lambda sums: {"per step": sums["score"] / sums["steps"]}
-    )
-    with console.progress("counting") as bar:
-        state = np.asarray(0)
-        return training.learn(learners, state, blank, step, check, lambda s: s, bar, checkpoints)
+    more = lambda sums: {"per step": sums["score"] / sums["steps"]}  # noqa: E731
+    learners = training.Learners(MEMBERS, ["a", "b"], 4.0, folder, more=more, **told)
+    state = np.asarray(0)
+    return training.learn(learners, state, blank, step, check, lambda s: s, checkpoints)
 
 
 def test_each_chunk_and_member_has_a_row(tmp_path):
@@ -64,6 +54,14 @@ def test_each_chunk_and_member_has_a_row(tmp_path):
     assert np.isnan(rows[0]["return_mean"])
 
 
+def test_progress_and_rows_are_told_as_they_come():
+    said, rows = [], []
+    learn(None, on_progress=lambda *of: said.append(of), on_metrics=rows.append, stage="counting")
+    assert [of[:3] for of in said] == [("counting", i, 4) for i in range(1, 5)]
+    assert said[0][3] == "return 8.0, 1 crashes in 1 episodes"
+    assert [(row["seed"], row["steps"]) for row in rows[:4]] == [(3, 5), (4, 6), (3, 10), (4, 12)]
+
+
 def test_what_is_no_number_stops_it_and_it_goes_on_from_there(tmp_path, monkeypatch):
     monkeypatch.setattr("rp_jax.checkpoints.INTERVAL", 0.0)
     monkeypatch.setattr("rp_jax.checkpoints.SHARE", float("inf"))
@@ -74,27 +72,3 @@ def test_what_is_no_number_stops_it_and_it_goes_on_from_there(tmp_path, monkeypa
     weights, rows, _ = learn(tmp_path, checkpoints)
     assert (weights, len(rows)) == (4, 8)
     assert rows[-1]["steps"] == 24
-
-
-@pytest.mark.parametrize("name", policy_gradient.LEARNERS)
-def test_an_interrupted_policy_gradient_goes_on_to_the_same_bits(name, tmp_path, monkeypatch):
-    rollout = ActorCriticConfig("categorical", 8, 16, minibatches=2)
-    learning = {"CPO": CPOConfig(rollout), "PID-Lagrangian": PIDConfig(rollout)}[name]
-    method = policy_gradient.Method(name, learning, 0.1)
-    planning = LoopConfig(steps=8 * 128, num_envs=8, batch=8, replay=64, replay_start=8)
-    pmdp, config = probe.make_pmdp(probe, probe.make_params()), tasks.Config(2, planning=planning)
-
-    def learn(folder):
-        kept = Checkpoints(folder / "checkpoints", run="one")
-        folder.mkdir(exist_ok=True)
-        agents = policy_gradient.learn(method, pmdp, config, folder, kept.at("planning"))
-        lines = (folder / "metrics.jsonl").read_text().splitlines()
-        untimed = [{k: v for k, v in json.loads(x).items() if k != "seconds"} for x in lines]
-        return agents.trained.params, untimed
-
-    with stopped_after(3, monkeypatch), pytest.raises(KeyboardInterrupt):
-        learn(tmp_path / "apart")
-    assert any((tmp_path / "apart" / "checkpoints" / "planning").iterdir())
-    apart, at_once = learn(tmp_path / "apart"), learn(tmp_path / "at_once")
-    jax.tree.map(np.testing.assert_array_equal, apart[0], at_once[0])
-    assert apart[1] == at_once[1]

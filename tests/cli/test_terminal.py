@@ -7,7 +7,8 @@ import sys
 import pytest
 
 TABLE = (
-    "from experiments import console; console.table('t', [dict.fromkeys('abcd', 'x' * 30)], 'abcd')"
+    "from rp_jax.cli import terminal; "
+    "terminal.table('t', [dict.fromkeys('abcd', 'x' * 30)], 'abcd')"
 )
 
 

@@ -1,6 +1,6 @@
 import pytest
 
-from experiments import tables
+from rp_jax.runs import tables
 
 
 def test_seeds_are_summed_up_by_hand():

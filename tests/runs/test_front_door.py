@@ -1,0 +1,331 @@
+"""reconnoitre, plan, evaluate, certify, save and load on the corridor of tests/probe.py."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probe
+import pytest
+from quick import stopped_after
+from tiny import programs_of_a_moment  # noqa: F401
+
+import rp_jax
+from rp_jax import LoopConfig, ThreatConfig
+from rp_jax.planning.pmdp import PMDP
+from rp_jax.runs.saved import about_agents
+from rp_jax.storage import StorageError
+from rp_jax.streams import Stream, key_of
+from rp_jax.threat.fit import FitConfig
+
+SMALL = ThreatConfig(
+    states=400,
+    sampling="uniform",
+    miss_rate=1.0,
+    test_states=50,
+    fit=FitConfig(hidden=(16,), steps=2000, batch=64, learning_rate=1e-2),
+)
+LEARNER = LoopConfig(steps=600, num_envs=8, batch=16, n_step=2, replay=256, replay_start=32)
+KEY = jax.random.key(0)
+STARTS = jax.vmap(probe.start_at)(jnp.arange(2.0, 5.0))
+
+
+def same(one, other):
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+@pytest.fixture(scope="module")
+def params():
+    return probe.make_params(slip=0.2)
+
+
+@pytest.fixture(scope="module")
+def threat(params):
+    return rp_jax.reconnoitre(KEY, probe, params, config=SMALL, x=0.5)
+
+
+@pytest.fixture(scope="module")
+def agents(params, threat):
+    return rp_jax.plan(KEY, probe, params, threat, x=0.5, seeds=2, config=LEARNER)
+
+
+def test_every_name_of_the_front_door_is_there():
+    for name in rp_jax.__all__:
+        assert getattr(rp_jax, name).__doc__
+        assert name in dir(rp_jax)
+    assert len(rp_jax.__all__) <= 25
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        rp_jax.nothing  # noqa: B018
+
+
+def test_importing_it_loads_nothing_that_is_heavy():
+    heavy = ("jax", "flax", "brax", "matplotlib", "gymnasium", "tyro", "rich", "scipy", "flashbax")
+    code = f"import rp_jax, sys; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_threat_function_says_how_good_it_is(threat):
+    assert set(threat.models) == set(threat.subs) == {"pit"}
+    assert threat.about["reports"]["pit"]["mae"] < 0.1
+    assert threat.about["sums"]["pit"]["unsafe"] >= 0
+
+
+def test_agents_act_in_one_state_or_many(agents):
+    actions = agents[0].act(STARTS)
+    assert actions.shape == (3,)
+    one = jax.tree.map(lambda a: a[1], STARTS)
+    assert agents[0].act(one) == actions[1]
+    percept = agents[0].look(STARTS)
+    assert percept.admissible[jnp.arange(3), actions].all()
+    assert [agent.pmdp.x for agent in agents] == [0.5, 0.5]
+    assert len(agents[1:]) == 1
+    same(agents[1:][0].weights, agents[1].weights)
+
+
+def test_agent_i_is_the_same_whoever_learns_beside_it(params, threat, agents):
+    alone = rp_jax.plan(KEY, probe, params, threat, x=0.5, seeds=[1], config=LEARNER)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5),
+        alone[0].weights,
+        agents[1].weights,
+    )
+    assert alone.members[0].seed == 1
+
+
+def test_several_thresholds_learn_side_by_side(params, threat):
+    several = rp_jax.plan(KEY, probe, params, threat, x=(0.1, 0.5), seeds=2, config=LEARNER)
+    assert [(m.x, m.seed) for m in several.members] == [(0.1, 0), (0.1, 1), (0.5, 0), (0.5, 1)]
+    assert several.methods[0] == "RP (x=0.1)"
+    free = rp_jax.plan(KEY, probe, params, learning_penalty=(0.0, 9.0), config=LEARNER)
+    assert free.methods == ["DQN (penalty 0)", "DQN (penalty 9)"]
+    assert free[0].look(STARTS).admissible.all()
+
+
+def test_progress_and_metrics_come_through_callbacks(params, threat):
+    told, rows = [], []
+    rp_jax.plan(
+        *(KEY, probe, params, threat),
+        x=0.5,
+        config=LEARNER,
+        on_progress=lambda *facts: told.append(facts),
+        on_metrics=rows.append,
+    )
+    stage, done, total, note = told[-1]
+    assert (stage, done) == ("planning", total)
+    assert "return" in note or "no episode" in note
+    assert [row["steps"] for row in rows] == sorted(row["steps"] for row in rows)
+    assert len(rows) == total
+
+
+def test_a_table_has_a_row_per_agent_and_prints(agents):
+    table = rp_jax.evaluate(KEY, agents, episodes=50, penalty=10.0, name="narrow")
+    assert [row["seed"] for row in table] == [0, 1]
+    assert {row["variant"] for row in table} == {"narrow"}
+    (summary,) = table.summary
+    assert summary["episodes"] == 100
+    assert len(str(table).splitlines()) == 4
+    again = rp_jax.evaluate(KEY, agents[1:], episodes=50, penalty=10.0)
+    assert again[0]["return_mean"] == pytest.approx(table[1]["return_mean"])
+    other = rp_jax.evaluate(KEY, agents, params=probe.make_params(slip=0.9), episodes=50)
+    assert other[0]["steps"] != table[0]["steps"]
+
+
+def test_a_certificate_is_planned_before_it_is_tested(agents):
+    plans = []
+    found = rp_jax.certify(
+        KEY, agents, c=0.9, confidence=0.9, expected=0.5, on_plan=lambda *p: plans.append(p)
+    )
+    assert plans == [(found.planned_episodes, found.allowed_crashes)]
+    assert found.shown == (found.crashes <= found.allowed_crashes)
+    assert str(found).startswith("SHOWN" if found.shown else "NOT SHOWN")
+
+
+def test_saved_agents_act_alike_in_another_process(agents, tmp_path):
+    rp_jax.save(tmp_path / "kept", agents, {"slip": 0.2})
+    code = (
+        "import sys, jax, jax.numpy as jnp; sys.path[:0] = sys.argv[2:]\n"
+        "import rp_jax, probe\n"
+        "agents = rp_jax.load(sys.argv[1])\n"
+        "states = jax.vmap(probe.start_at)(jnp.arange(2.0, 5.0))\n"
+        "print(float(agents.pmdp.params.slip), *agents[1].act(states))"
+    )
+    path = str(probe.__file__).rpartition("/")[0]
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "kept"), path], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    slip, *actions = done.stdout.split()
+    assert float(slip) == pytest.approx(0.2)
+    assert [int(a) for a in actions] == agents[1].act(STARTS).tolist()
+
+
+def test_parameters_that_settings_do_not_tell_come_back_too(params, threat, tmp_path):
+    changed = params.replace(bait=jnp.asarray(7.0), slip=jnp.asarray(0.6))
+    learner = dataclasses.replace(LEARNER, steps=100)
+    agents = rp_jax.plan(KEY, probe, changed, threat, x=0.5, config=learner)
+    rp_jax.save(tmp_path, agents)
+    again = rp_jax.load(tmp_path, probe)
+    same(again.pmdp.params, changed)
+    assert again.pmdp.insecure_penalty == agents.pmdp.insecure_penalty
+    assert again.config == learner
+    same(again.weights, agents.weights)
+
+
+def test_a_world_that_cannot_be_found_must_be_given(agents, tmp_path):
+    class World:
+        def __getattr__(self, name):
+            if name in ("make_params", "__name__", "__file__"):
+                raise AttributeError(name)
+            return getattr(probe, name)
+
+    env = World()
+    lonely = dataclasses.replace(agents, pmdp=agents.pmdp.replace(env=env))
+    rp_jax.save(tmp_path, lonely)
+    with pytest.raises(StorageError, match="cannot be imported"):
+        rp_jax.load(tmp_path)
+    with pytest.raises(StorageError, match="the parameters were not made by make_params alone"):
+        rp_jax.load(tmp_path, env)
+    same(rp_jax.load(tmp_path, env, agents.pmdp.params).weights, agents.weights)
+
+
+def test_a_threat_function_is_saved_and_loaded_alone(threat, params, tmp_path):
+    rp_jax.save(tmp_path, threat)
+    again = rp_jax.load(tmp_path, probe, params)
+    same(again.models, threat.models)
+    assert again.about["reports"]["pit"] == pytest.approx(threat.about["reports"]["pit"])
+    wide = params.replace(pit=params.pit.replace(radius=jnp.asarray(0.9)))
+    with pytest.raises(StorageError, match=r"pit: source/radius is 0\.5"):
+        rp_jax.load(tmp_path, probe, wide)
+    with pytest.raises(StorageError, match=r"threat: pit: source/radius is 0\.5"):
+        rp_jax.plan(KEY, probe, wide, threat, x=0.5, config=LEARNER)
+
+
+def call(folder, params, **more):
+    threat = rp_jax.reconnoitre(
+        KEY, probe, params, config=SMALL, x=0.5, folder=folder / "threat", **more
+    )
+    learner = dataclasses.replace(LEARNER, steps=400)
+    return rp_jax.plan(
+        KEY, probe, params, threat, x=0.5, seeds=2, config=learner, folder=folder, **more
+    )
+
+
+def test_the_same_call_goes_on_to_the_same_bits_and_is_done_once(params, tmp_path, monkeypatch):
+    alone = call(tmp_path / "alone", params)
+    folder = tmp_path / "run"
+    stops = 0
+    for steps in (3, 20, 2, 9):
+        with stopped_after(steps, monkeypatch):
+            try:
+                call(folder, params)
+            except KeyboardInterrupt:
+                stops += 1
+    assert stops >= 2
+    found = call(folder, params)
+    same(found.weights, alone.weights)
+    assert not (folder / "checkpoints").exists()
+    told = []
+    again = call(folder, params, on_progress=lambda *facts: told.append(facts))
+    assert told == []  # nothing was done again
+    same(again.weights, alone.weights)
+    assert len(again.history) == len(alone.history)
+
+
+def test_a_folder_of_something_else_is_refused(params, tmp_path, monkeypatch):
+    call(tmp_path, params)
+    other = probe.make_params(slip=0.3)
+    threat = rp_jax.load(tmp_path / "threat", probe, params)
+    with pytest.raises(ValueError, match=r"folder is .*; its params is"):
+        call(tmp_path, other)
+    with pytest.raises(ValueError, match=r"its config: steps is 400; it must be 600"):
+        rp_jax.plan(KEY, probe, params, threat, x=0.5, seeds=2, config=LEARNER, folder=tmp_path)
+    with stopped_after(2, monkeypatch), pytest.raises(KeyboardInterrupt):
+        rp_jax.reconnoitre(KEY, probe, params, config=SMALL, folder=tmp_path / "new")
+    with pytest.raises(ValueError, match=r"its x is 0\.01; it must be 0\.5"):
+        rp_jax.reconnoitre(KEY, probe, params, config=SMALL, x=0.5, folder=tmp_path / "new")
+    spec = json.loads((tmp_path / "new" / "checkpoints" / "threat" / "spec.json").read_text())
+    assert spec["x"] == 0.01
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"x": -0.1}, r"^x is -0\.1; it must be a number, at least 0"),
+        ({"x": float("nan")}, r"^x is nan"),
+        ({"seeds": 0}, r"^seeds is 0; it must be an integer, at least 1"),
+        ({"seeds": [0, -1]}, r"^seeds is -1"),
+        ({"x": ()}, r"^x, learning_penalty and seeds must each"),
+        ({"x": (0.1, 0.2), "learning_penalty": (1.0, 2.0, 3.0)}, r"^learning_penalty has 3 values"),
+        ({"lookahead": -1}, r"^lookahead is -1"),
+        ({"penalty": -1.0}, r"^penalty is -1"),
+        ({"insecure_penalty": float("inf")}, r"^insecure_penalty is inf"),
+        ({"devices": "two"}, r"^devices is 'two'; it must be one of"),
+        ({"config": LoopConfig(batch=0)}, r"^config.batch is 0"),
+        ({"key": 0}, r"^key is 0; it must be one key of jax.random.key"),
+        ({"threat": "results"}, r"^threat is str; it must be a ThreatFunction"),
+    ],
+)
+def test_planning_names_what_is_out_of_range(change, says, params, threat):
+    given = {"key": KEY, "env": probe, "params": params, "threat": threat, "x": 0.5, **change}
+    with pytest.raises(ValueError, match=says):
+        rp_jax.plan(**given)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"x": 0.0}, r"^x is 0\.0; it must be a finite number, above 0"),
+        (
+            {"config": {"lion": SMALL}},
+            r"^config: kind of hazard is 'lion'; it must be one of 'pit'",
+        ),
+        ({"config": 3}, r"^config is 3; it must be a ThreatConfig"),
+        ({"config": ThreatConfig(states=5)}, r"^pit.states is 5"),
+        ({"devices": ""}, r"^devices is ''"),
+    ],
+)
+def test_reconnaissance_names_what_is_out_of_range(change, says, params):
+    with pytest.raises(ValueError, match=says):
+        rp_jax.reconnoitre(**{"key": KEY, "env": probe, "params": params, **change})
+
+
+def test_evaluation_and_saving_name_what_they_are_not_made_for(agents, tmp_path):
+    with pytest.raises(ValueError, match=r"(?s)agents is .*; it must be Agents"):
+        rp_jax.evaluate(KEY, agents.weights)
+    with pytest.raises(ValueError, match="episodes is 0"):
+        rp_jax.evaluate(KEY, agents, episodes=0)
+    with pytest.raises(ValueError, match="agent is 2; it must be an integer, at least 0, at most"):
+        rp_jax.certify(KEY, agents, c=0.5, agent=2)
+    with pytest.raises(ValueError, match="c is 0"):
+        rp_jax.certify(KEY, agents, c=0)
+    with pytest.raises(ValueError, match="thing is one Agent"):
+        rp_jax.save(tmp_path, agents[0])
+    with pytest.raises(ValueError, match="thing is 3"):
+        rp_jax.save(tmp_path, 3)
+    with pytest.raises(StorageError, match=r"manifest\.json"):
+        rp_jax.load(tmp_path / "nothing", probe)
+
+
+def test_plain_numbers_are_good_scalars(params, threat):
+    pmdp = PMDP(params, dict(threat.models), 0.5, 0.0, 0.0, probe)
+    exact = pmdp.replace(x=jnp.asarray(0.5))
+    same(pmdp.perceive(STARTS), exact.perceive(STARTS))
+    free = PMDP(params, {}, float("inf"), 0.0, 0.0, probe, shielded=False)
+    assert free.perceive(STARTS).admissible.all()
+
+
+def test_streams_share_no_draw():
+    keys = [jax.random.key_data(key_of(KEY, stream)).tolist() for stream in Stream]
+    assert len({tuple(key) for key in keys}) == len(Stream)
+
+
+def test_facts_of_agents_are_readable(agents, tmp_path):
+    rp_jax.save(tmp_path, agents)
+    about = about_agents(tmp_path)
+    assert about["env"] == "probe"
+    assert about["observation"] == {"scan": 2, "rest": 2}
+    assert about["members"][1] == {"seed": 1, "x": 0.5, "learning_penalty": 0.0}
