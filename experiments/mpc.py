@@ -78,7 +78,7 @@ def prepared(config: Config) -> Ready:
 
 def job(config: Config, ready: Ready, folder: Path) -> None:
     """Plays all variants; writes the table and shows it."""
-    with terminal.progress() as bar:
+    with terminal.progress(f"MPC ({config.horizon} steps)") as bar:
         found = evaluate_search(
             jax.random.key(config.seed),
             ready.searches,

@@ -17,6 +17,7 @@ from rp_jax.runs.train import World
 
 def make_world(config: Any) -> World:
     """Jam's, with the other reward; threat functions do not know the difference."""
+    shields.check(config)
     return jam.make_world(config)._replace(name="patrol", env=patrol)
 
 

@@ -35,7 +35,12 @@ class Episodes(NamedTuple):
 
 
 def action_values(network: nn.Module, weights: Any) -> Callable[[Percept], Array]:
-    """Returns the function from a percept to the action values (B, A) of a Q-network."""
+    """Returns the function from a percept to the action values (B, A) of a Q-network.
+
+    Args:
+        network: of the action values.
+        weights: of the network.
+    """
     return lambda percept: jnp.asarray(network.apply(weights, percept.encoded))
 
 
@@ -109,7 +114,13 @@ def play_episodes(
 
 
 def round_keys(key: Array, episodes: int, batch: int) -> Array:
-    """Returns one key for each `play_round` of `play_episodes`, (rounds,)."""
+    """Returns one key for each `play_round` of `play_episodes`, (rounds,).
+
+    Args:
+        key: of all episodes.
+        episodes: how many, at least.
+        batch: episodes of a round.
+    """
     return jax.random.split(key, -(-episodes // batch))
 
 
@@ -185,7 +196,12 @@ def added(rows: Episodes, step: Episodes, moved: Array) -> Episodes:
 
 
 def check(rows: Episodes, name: str) -> None:
-    """Raises FloatingPointError if an episode saw or earned what is not a finite number."""
+    """Raises FloatingPointError if an episode saw or earned what is not a finite number.
+
+    Args:
+        rows: of the episodes.
+        name: of them, for the message.
+    """
     none_bad(name, rows)
     finite(f"{name}: returns", rows.score)
     finite(f"{name}: dangers", rows.danger)

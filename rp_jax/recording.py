@@ -66,7 +66,12 @@ def record(
 
 
 def explore(key: Array, percept: Percept) -> tuple[Array, Array]:
-    """Chooses uniformly inside the admissible set; a `rollout.Policy`."""
+    """Chooses uniformly inside the admissible set; a `rollout.Policy`.
+
+    Args:
+        key: of the choice.
+        percept: of states (B,).
+    """
     keys = jax.random.split(key, percept.secure.shape[0])
     action = jax.vmap(shield.masked_sample)(keys, percept.admissible)
     return action, jnp.zeros(percept.secure.shape, bool)

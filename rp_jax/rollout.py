@@ -17,18 +17,32 @@ Carry = TypeVar("Carry")
 Policy = Callable[[Array, Any], tuple[Array, Array]]
 
 
-class World(Protocol):
-    """What episodes are played in: a `PMDP`, or anything that looks and steps like one."""
+class Playable(Protocol):
+    """A world that episodes are played in: a `PMDP`, or anything that looks and steps like one."""
 
     def perceive(self, states: Any, alive: Array | None = None) -> Any:
-        """Returns what the policy is told of states (B,); rows not `alive` need not be right."""
+        """Returns what the policy is told of states.
+
+        Args:
+            states: leading axis (B,).
+            alive: (B,) bool; the other rows need not be right.
+        """
 
     def advance(self, keys: Array, states: Any, actions: Array) -> tuple[Any, Outcome]:
-        """Makes one transition of each state (B,)."""
+        """Makes one transition of each state.
+
+        Args:
+            keys: (B,).
+            states: leading axis (B,).
+            actions: (B,) or (B, D).
+
+        Returns:
+            The states after, and the outcomes of the step.
+        """
 
 
 class Step(NamedTuple):
-    """What happened in one step of all episodes, leading axes (B,)."""
+    """One step of all episodes, leading axes (B,)."""
 
     time: Array  # () int, steps made before
     alive: Array  # bool, the episode had not ended before this step
@@ -42,13 +56,17 @@ class Step(NamedTuple):
 
 
 def ended(outcome: Outcome) -> Array:
-    """Returns whether an episode is over, for either reason, (B,) bool."""
+    """Returns whether an episode is over, for either reason, (B,) bool.
+
+    Args:
+        outcome: of its last step.
+    """
     return outcome.done
 
 
 def rollout(
     key: Array,
-    world: World,
+    world: Playable,
     policy: Policy,
     states: Any,
     fold: Callable[[Carry, Step], Carry],

@@ -3,13 +3,11 @@
 python tests/spreading.py SETTING prints what is equal, as JSON; started by test_devices.py.
 """
 
-import dataclasses
 import json
 import sys
 import tempfile
 from pathlib import Path
 
-import forked
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,11 +15,10 @@ import probe
 import pytest
 from quick import stopped_after
 
-from experiments import planning, tasks
 from rp_jax import devices
-from rp_jax.checkpoints import Checkpoints
 from rp_jax.planning import loop
 from rp_jax.recon import labels, sampling
+from rp_jax.runs.plan import plan
 
 SEEDS = 4
 LOOP = loop.LoopConfig(steps=200, num_envs=8, batch=16, replay=256, replay_start=32)
@@ -54,17 +51,12 @@ def labelled(mesh):
 
 
 def resumed(folder):
-    """Weights of a run that was interrupted half-way and resumed, and of one that was not."""
-    presets, make_task = forked.corridor()
-    config = dataclasses.replace(presets["quick"]("tuned"), devices="all", seeds=SEEDS)
-    task = make_task(config)
-    pmdp = tasks.make_pmdp(task, config, None, task.train)
-    members = tasks.members_of(config)
+    """Weights of a job that was interrupted half-way and resumed, and of one that was not."""
 
     def learn(name):
-        (folder / name).mkdir(exist_ok=True)
-        kept = Checkpoints(folder / name / "checkpoints", run="a")
-        return planning.plan(config, pmdp, members, folder / name, kept.at("planning")).params
+        key, params = jax.random.key(0), probe.make_params()
+        settings = {"seeds": SEEDS, "config": LOOP, "devices": "all", "folder": folder / name}
+        return plan(key, probe, params, **settings).weights
 
     with stopped_after(11, pytest.MonkeyPatch()), pytest.raises(KeyboardInterrupt):
         learn("apart")

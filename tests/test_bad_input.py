@@ -16,13 +16,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from quick import compile_soon  # noqa: F401
 
-from experiments import circuit as driving
-from experiments import jam as jamming
 from rp_jax import evaluation, shield
 from rp_jax.envs import circuit, jam, point_gather, tracks
 from rp_jax.envs.tracks import TrackPlan
 from rp_jax.planning import dqn, loop
 from rp_jax.recon import labels
+from rp_jax.runs import train
+from rp_jax.runs.train import Process, TrainConfig, World
 from rp_jax.threat import build, fit
 
 MANY = int(os.environ.get("RP_FUZZ", "1000"))
@@ -87,14 +87,21 @@ def validated(name, changes):
     named([f"{name}.{field}" for field in {*changes, *relied}], lambda: config.validate(name))
 
 
-def run_validated(module, changes):
-    config = dataclasses.replace(module.quick("tuned"), **changes)
-    named(changes, config.validate)
+def run_validated(changes):
+    named(changes, dataclasses.replace(TrainConfig(), **changes).validate)
 
 
-RUNS = st.sampled_from([driving, jamming])
-SHARED = "seeds seed x learning_penalty insecure_penalty penalty episodes devices fidelity baseline"
-of_runs = st.dictionaries(st.sampled_from(SHARED.split()), junk, min_size=1, max_size=3)
+CORRIDOR = World("corridor", probe, {}, {"as learned": {}})
+
+
+def checked(devices):
+    process = Process(devices=devices)
+    named(["devices"], lambda: train.checked(CORRIDOR, TrainConfig(), {}, process))
+
+
+RUN = "seeds seed x lookahead learning_penalty learning_penalty_from insecure_penalty penalty "
+RUN += "episodes"
+of_runs = st.dictionaries(st.sampled_from(RUN.split()), junk, min_size=1, max_size=3)
 
 
 class TestConfigurations:
@@ -109,16 +116,21 @@ class TestConfigurations:
     def test_many(self, change):
         validated(*change)
 
-    @given(RUNS, of_runs)
+    @given(of_runs)
     @some
-    def test_some_of_runs(self, module, changes):
-        run_validated(module, changes)
+    def test_some_of_runs(self, changes):
+        run_validated(changes)
 
     @pytest.mark.slow
-    @given(RUNS, of_runs)
+    @given(of_runs)
     @many
-    def test_many_of_runs(self, module, changes):
-        run_validated(module, changes)
+    def test_many_of_runs(self, changes):
+        run_validated(changes)
+
+    @given(junk)
+    @some
+    def test_some_devices(self, devices):
+        checked(devices)
 
 
 ENVS = {

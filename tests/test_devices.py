@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 def start(setting, **environment):
     environment = {
         **os.environ,
-        "PYTHONPATH": f"{ROOT}:{ROOT / 'tests' / 'experiments'}",
+        "PYTHONPATH": str(ROOT),
         "JAX_PLATFORMS": "cpu",
         **environment,
     }

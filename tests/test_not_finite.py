@@ -11,18 +11,17 @@ import probe
 import pytest
 from quick import compile_soon  # noqa: F401
 
-from experiments import policy_gradient, tasks
 from rp_jax import evaluation, rare, shield
 from rp_jax.baselines import actor_critic
 from rp_jax.baselines.actor_critic import ActorCriticConfig
 from rp_jax.baselines.cpo import CPOConfig
 from rp_jax.baselines.pid_lagrangian import PIDConfig
-from rp_jax.checkpoints import NO_CHECKPOINTS
 from rp_jax.planning import dqn, loop
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.planning.percept import encode
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.recon import labels
+from rp_jax.runs import policy_gradient
 from rp_jax.threat import build
 from rp_jax.threat.fit import Dataset, FitConfig
 
@@ -189,33 +188,28 @@ def test_gradients_are_named(wrong, monkeypatch):
         trained(probe.make_pmdp(probe, PARAMS), one)
 
 
-@pytest.mark.parametrize("name", policy_gradient.LEARNERS)
-def test_policy_gradients_stop_at_rewards_that_are_none(name, tmp_path):
-    """CPO would go on in silence: its line search accepts no step, and its policy stays finite."""
-    env, rollout = paid_with(np.nan), ActorCriticConfig("categorical", 8, 16, minibatches=2)
-    learning = {"CPO": CPOConfig(rollout), "PID-Lagrangian": PIDConfig(rollout)}[name]
-    method, pmdp = policy_gradient.Method(name, learning, 0.1), probe.make_pmdp(env, PARAMS)
-    config = tasks.Config(planning=dataclasses.replace(CONFIG, steps=256))
-    with pytest.raises(FloatingPointError, match=rf"^{name}: rewards of \d+ steps are nan"):
-        policy_gradient.learn(method, pmdp, config, tmp_path / "it", NO_CHECKPOINTS)
-
-
-@pytest.mark.parametrize("name", policy_gradient.LEARNERS)
-def test_policy_gradients_name_observations_and_what_is_learned(name, tmp_path, monkeypatch):
+def learns(name, env):
     rollout = ActorCriticConfig("categorical", 8, 16, minibatches=2)
-    learning = {"CPO": CPOConfig(rollout), "PID-Lagrangian": PIDConfig(rollout)}[name]
-    method = policy_gradient.Method(name, learning, 0.1)
-    config = tasks.Config(planning=dataclasses.replace(CONFIG, steps=256))
+    config = {"CPO": CPOConfig, "PID-Lagrangian": PIDConfig}[name](rollout)
+    policy_gradient.learn_policies(
+        jax.random.key(0), env, PARAMS, name, c=0.1, config=config, steps=256
+    )
 
-    def learns(env, folder):
-        pmdp = probe.make_pmdp(env, PARAMS)
-        policy_gradient.learn(method, pmdp, config, tmp_path / folder, NO_CHECKPOINTS)
 
+@pytest.mark.parametrize("name", policy_gradient.LEARNERS)
+def test_policy_gradients_stop_at_rewards_that_are_none(name):
+    """CPO would go on in silence: its line search accepts no step, and its policy stays finite."""
+    with pytest.raises(FloatingPointError, match=rf"^{name}: rewards of \d+ steps are nan"):
+        learns(name, paid_with(np.nan))
+
+
+@pytest.mark.parametrize("name", policy_gradient.LEARNERS)
+def test_policy_gradients_name_observations_and_what_is_learned(name, monkeypatch):
     with pytest.raises(FloatingPointError, match=rf"^{name}: observations of \d+ steps are nan"):
-        learns(seen_with(np.inf, 17), "seen")
+        learns(name, seen_with(np.inf, 17))
     monkeypatch.setattr(actor_critic.optax, "adam", lambda *_, **__: faulty(np.nan))
     with pytest.raises(FloatingPointError, match=f"^{name}: values' weights"):
-        learns(probe, "learned")
+        learns(name, probe)
 
 
 @pytest.mark.parametrize("wrong", WRONG[:2])

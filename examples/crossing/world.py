@@ -26,7 +26,7 @@ TURNS = (-0.1, 0.0, 0.1)  # radians / step
 
 
 def make_agent() -> VehicleModel:
-    """A car that never reverses, and what it does while threats are measured: mostly brake."""
+    """Returns a car that never reverses; while threats are measured, it mostly brakes."""
     return VehicleModel(
         actions=control_table(ACCELERATIONS, TURNS),
         baseline=independent_controls(ACCELERATIONS, (0.7, 0.2, 0.1), TURNS, (0.2, 0.6, 0.2)),
@@ -51,39 +51,38 @@ class Pedestrian(struct.PyTreeNode):
     pace: Array  # () of those who walk
     window: Window
     horizon: int = struct.field(pytree_node=False, default=8)
-    static: bool = struct.field(pytree_node=False, default=False)
 
     def draw(self, key: Array, shape: tuple[int, ...] = ()) -> Array:
-        """(..., 2) what decides whether it walks, and whether it turns round."""
+        """Draws (..., 2) numbers: whether it walks, and whether it turns round."""
         return jax.random.uniform(key, (*shape, 2))
 
     def step(self, hazard: Walker, body: Vehicle, noise: Array) -> Walker:
-        """It walks in 7 of 10 steps, but into no car that stands; it turns round in 1 of 20."""
+        """Walks in 7 of 10 steps, but into no car that stands; turns round in 1 of 20."""
         way = jnp.where(noise[1] < 0.05, -hazard.way, hazard.way)
         moved = Walker(hazard.position + self.pace * hazard.way, way)
         stays = (noise[0] > 0.7) | ((body.speed <= 0) & self.hits(body, moved))
         return moved.replace(position=jnp.where(stays, hazard.position, moved.position))
 
     def hits(self, body: Vehicle, hazard: Walker) -> Array:
-        """Centres nearer than `distance`."""
+        """Returns whether the centres are nearer than `distance`."""
         return squared_distance(hazard.position, body.position) < jnp.square(self.distance)
 
     def in_reach(self, body: Vehicle, hazard: Walker) -> Array:
-        """In the window."""
+        """Returns whether it is in the window."""
         return self.window.contains(to_ego(hazard.position - body.position, body.heading))
 
     def features(self, body: Vehicle, hazard: Walker) -> Array:
-        """(5,) in the car's frame: position (2), way (2); the car's speed."""
+        """Returns (5,), in the car's frame: position (2), way (2); the car's speed."""
         relative = to_ego(hazard.position - body.position, body.heading)
         way = to_ego(hazard.way, body.heading)
         return jnp.concatenate([relative, way, body.speed[None]])
 
     def mirrored(self, features: Array) -> Array:
-        """What is on the left comes to the right."""
+        """Returns the features with left and right exchanged."""
         return features * jnp.broadcast_to(jnp.asarray([1.0, -1.0, 1.0, -1.0, 1.0]), features.shape)
 
     def sample(self, key: Array, model: VehicleModel) -> tuple[Vehicle, Walker]:
-        """Anywhere in the window, walking anywhere, before a car of any speed."""
+        """Draws a walker anywhere in the window, walking anywhere, and a car of any speed."""
         where, turn, fast = jax.random.split(key, 3)
         angle = jax.random.uniform(turn, (), float, -jnp.pi, jnp.pi)
         way = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
@@ -91,7 +90,7 @@ class Pedestrian(struct.PyTreeNode):
         return car, Walker(self.window.sample(where), way)
 
     def state_of(self, features: Array) -> tuple[Vehicle, Walker]:
-        """The inverse of `features`, the car at the origin."""
+        """Returns the pair with these features, the car at the origin."""
         way = features[2:4] / jnp.linalg.norm(features[2:4])
         return make_vehicle(jnp.zeros(2), 0.0, features[4]), Walker(features[:2], way)
 
@@ -126,7 +125,7 @@ class Params(struct.PyTreeNode):
 
 
 def make_params(pedestrians: int = 6, time_limit: int = 100) -> Params:
-    """A road with so many pedestrians.
+    """Returns a road with so many pedestrians.
 
     Raises:
         ValueError: a value is out of range.
@@ -151,7 +150,7 @@ def make_params(pedestrians: int = 6, time_limit: int = 100) -> Params:
 
 
 def reset(key: Array, params: Params) -> State:
-    """The car at rest where the road begins; pedestrians anywhere ahead."""
+    """Returns the car at rest where the road begins, and pedestrians anywhere ahead."""
     where, side = jax.random.split(key)
     count = params.pedestrians
     low, high = jnp.asarray([0.8, -PAVEMENT]), jnp.asarray([LENGTH, PAVEMENT])
@@ -163,7 +162,7 @@ def reset(key: Array, params: Params) -> State:
 
 
 def step(key: Array, state: State, action: Array, params: Params) -> tuple[State, contract.Outcome]:
-    """All move; 10 for each unit of way made, -.05 a step, 5 at the end of the road."""
+    """Moves all; 10 for each unit of way made, -.05 a step, 5 at the end of the road."""
     source = params.pedestrian
 
     def walk(n: Array, walker: Walker) -> Walker:
@@ -192,8 +191,8 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
 
 
 def observe(state: State, params: Params) -> Array:
-    """(21,) position (2), heading (2) and speed; of 4 pedestrians, the nearest first, position and
-    way in the car's frame, at (3, 0) where there are fewer."""
+    """Returns (21,): position (2), heading (2) and speed; of 4 pedestrians, the nearest first,
+    position and way in the car's frame, at (3, 0) where there are fewer."""
     car, n = state.body, params.pedestrians
     see = lambda walker: params.pedestrian.features(car, walker)[:4]  # noqa: E731
     rows = jax.vmap(see)(state.walkers)
@@ -204,7 +203,7 @@ def observe(state: State, params: Params) -> Array:
 
 
 def hazards(state: State, params: Params) -> dict[str, contract.Hazards]:
-    """All pedestrians, and the parked cars near by."""
+    """Returns all pedestrians, and the parked cars near by."""
     along = GAP * (jnp.round(state.body.position[0] / GAP) + jnp.arange(-3.0, 4.0))
     sides = [jnp.stack([along, jnp.full(7, y, along.dtype)], axis=-1) for y in (KERB, -KERB)]
     return {
@@ -214,14 +213,14 @@ def hazards(state: State, params: Params) -> dict[str, contract.Hazards]:
 
 
 def collisions(state: State, params: Params) -> dict[str, Array]:
-    """Whether a pedestrian or a parked car is being hit."""
+    """Returns whether a pedestrian or a parked car is being hit."""
     found, subs = hazards(state, params), sub_rmdps(params)
     hits = {kind: jax.vmap(sub.source.hits, (None, 0)) for kind, sub in subs.items()}
     return {kind: jnp.any(hits[kind](state.body, found[kind].state)) for kind in subs}
 
 
 def sub_rmdps(params: Params) -> dict[str, SubRMDP]:
-    """One car and one pedestrian; one car and one parked car."""
+    """Returns one car and one pedestrian; one car and one parked car."""
     return {
         "pedestrian": SubRMDP(body=params.body, source=params.pedestrian, beta=params.beta),
         "parked": SubRMDP(body=params.body, source=params.parked, beta=params.beta),

@@ -12,8 +12,7 @@ from rp_jax.validate import number
 ACCELERATION, TOP_SPEED = 0.025, 0.1  # of the drone, at most, on each axis; a step lasts 1
 FIELD = (4.0, 2.0)  # discs turn back at its sides; the drone meets a wall at y = 0 alone
 PYLONS = ((1.0, 0.5), (1.0, 1.5), (2.0, 1.0), (3.0, 0.5), (3.0, 1.5))
-START, GOAL, NEAR = (0.3, 1.0), (3.7, 0.7), 0.3  # the drone is to come this near to the goal
-SEEN = 4  # discs observed, the nearest ones
+START, GOAL, NEAR, SEEN = (0.3, 1.0), (3.7, 0.7), 0.3, 4  # NEAR: radius of the goal; SEEN: discs
 
 
 class Motion(struct.PyTreeNode):
@@ -61,7 +60,7 @@ class Obstacle(struct.PyTreeNode):
     top_speed: Array | float = 0.0
     jitter: Array | float = 0.0  # greatest change of its velocity in a step
     axes: tuple[int, int] = struct.field(pytree_node=False, default=(1, 1))  # (0, 1): a wall
-    horizon: int = struct.field(pytree_node=False, default=8)
+    horizon: int = struct.field(pytree_node=False, default=5)  # the drone brakes in 4 steps
 
     def draw(self, key: Array, shape: tuple[int, ...] = ()) -> Array:
         """Returns changes of velocity (..., 2)."""
@@ -85,13 +84,12 @@ class Obstacle(struct.PyTreeNode):
         return jnp.linalg.norm(self.features(body, hazard)[:2]) < self.radius
 
     def window(self, body: Motion, hazard: Motion) -> Window:
-        """Returns where, from the drone, it may be hit while the drone brakes after any action."""
+        """Returns where, from the drone, it may be hit within the horizon."""
         own, other = (jnp.stack([-m.velocity, m.velocity]) for m in (body, hazard))
-        a, n = ACCELERATION, self.horizon
-        speed = jnp.clip(own + a, 0.0, TOP_SPEED)
-        braking = own + (speed + a / 2) ** 2 / (2 * a)  # >= own + speed + (speed - a) + ...
+        n = self.horizon
+        way = jnp.clip(n * (own + ACCELERATION * (n - 1) / 2), 0.0, n * TOP_SPEED)
         drift = jnp.clip(n * (self.jitter * (n - 1) / 2 - other), 0.0, n * self.top_speed)
-        lower, upper = self.radius + jnp.maximum(braking, 0.0) + drift + 1e-5
+        lower, upper = self.radius + way + drift + 1e-5
         return Window(-lower, upper)
 
     def in_reach(self, body: Motion, hazard: Motion) -> Array:
@@ -128,8 +126,8 @@ def make_params(discs: int = 10, *, time_limit: int = 100) -> Params:
     number("discs", discs, least=SEEN, most=100, integer=True)
     number("time_limit", time_limit, least=1, most=10**9, integer=True)
     table = ACCELERATION * jnp.asarray([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
-    wall = Obstacle(0.1, axes=(0, 1))
-    sources = {"disc": Obstacle(0.12, 0.02, 0.002), "pylon": Obstacle(0.1), "wall": wall}
+    disc, wall = Obstacle(0.12, 0.02, 0.002, horizon=8), Obstacle(0.1, axes=(0, 1))
+    sources = {"disc": disc, "pylon": Obstacle(0.1), "wall": wall}
     return Params(Drone(table, Brake()), sources, jnp.asarray(time_limit, jnp.int32), discs)
 
 
@@ -144,26 +142,25 @@ def reset(key: Array, params: Params) -> State:
 
 
 def step(key: Array, state: State, action: Array, params: Params) -> tuple[State, Outcome]:
-    """All move; 10 for each length nearer to the goal, 5 at it, -.05 a step; a hit ends it."""
+    """Moves all: 10 for each length nearer to the goal, 5 at it, -.05 a step; a hit ends it."""
     body, disc = params.body.step(state.body, params.body.control(action)), params.sources["disc"]
     noise = disc.draw(key, (params.discs,))
     moved = jax.vmap(disc.step, (0, None, 0))(state.obstacles["disc"], state.body, noise)
-    out = jnp.sign(moved.position - jnp.clip(moved.position, 0.0, jnp.asarray([FIELD])))
-    turned = jnp.where(out == 0, moved.velocity, -out * jnp.abs(moved.velocity))
-    there = {**state.obstacles, "disc": moved.replace(velocity=turned)}
-    hits = [jax.vmap(v.hits, (None, 0))(body, there[k]) for k, v in params.sources.items()]
+    out = moved.position - jnp.clip(moved.position, 0.0, jnp.asarray([FIELD]))
+    discs = moved.replace(velocity=moved.velocity * jnp.where(out * moved.velocity > 0, -1, 1))
+    new = State(body, {**state.obstacles, "disc": discs}, state.time + 1)
+    hits = [jax.vmap(v.hits, (None, 0))(body, new.obstacles[k]) for k, v in params.sources.items()]
     crashed = jnp.any(jnp.concatenate(hits))
     left, before = (jnp.linalg.norm(jnp.asarray(GOAL) - b.position) for b in (body, state.body))
     goal = (left < NEAR) & ~crashed
-    reward, time = 10.0 * (before - left) - 0.05 + 5.0 * goal, state.time + 1
-    ends = ended(crashed | goal, time, params.time_limit)
-    return State(body, there, time), Outcome(reward, crashed.astype(reward.dtype), *ends, goal)
+    reward = 10.0 * (before - left) - 0.05 + 5.0 * goal
+    ends = ended(crashed | goal, new.time, params.time_limit)
+    return new, Outcome(reward, crashed.astype(reward.dtype), *ends, goal)
 
 
 def observe(state: State, params: Params) -> Array:
     """Returns (26,): the way to the goal, and the `features` of the nearest discs."""
-    see = jax.vmap(params.sources["disc"].features, (None, 0))
-    seen = see(state.body, state.obstacles["disc"])
+    seen = jax.vmap(params.sources["disc"].features, (None, 0))(state.body, state.obstacles["disc"])
     nearest = jnp.argsort(jnp.linalg.norm(seen[:, :2], axis=-1))[:SEEN]
     return jnp.concatenate([jnp.asarray(GOAL) - state.body.position, seen[nearest].ravel()])
 

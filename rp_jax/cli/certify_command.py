@@ -23,8 +23,8 @@ from rp_jax.validate import number
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Choice):
-    """What is to be shown."""
+class CertifyOptions(Choice):
+    """Options of `rp-jax certify`."""
 
     c: float  # crash rate not to be exceeded
     confidence: float = 0.99  # of the statement
@@ -44,7 +44,7 @@ def main(argv: Sequence[str]) -> None:
     Args:
         argv: arguments after "certify".
     """
-    config = tyro.cli(Config, args=list(argv), prog="rp-jax certify", description=__doc__)
+    config = tyro.cli(CertifyOptions, args=list(argv), prog="rp-jax certify", description=__doc__)
     with errors.bad_input():
         errors.needs_folder(config.out)
         found = chosen(config)

@@ -23,8 +23,8 @@ from rp_jax.runs.crashes import CrashConfig, look_at_crashes
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Choice):
-    """What is looked at."""
+class CrashesOptions(Choice):
+    """Options of `rp-jax crashes`."""
 
     out: Path  # new folder for the results
     sizes: Annotated[CrashConfig, tyro.conf.arg(name="")] = field(default_factory=CrashConfig)
@@ -36,7 +36,7 @@ class Config(Choice):
         self.sizes.validate()
 
 
-def run(config: Config, found: Chosen, folder: Path) -> dict[str, Any]:
+def run(config: CrashesOptions, found: Chosen, folder: Path) -> dict[str, Any]:
     """Looks at crashes; writes crashes.json, kept up to date, and the figure.
 
     Args:
@@ -95,7 +95,7 @@ def main(argv: Sequence[str]) -> None:
     Args:
         argv: arguments after "crashes".
     """
-    config = tyro.cli(Config, args=list(argv), prog="rp-jax crashes", description=__doc__)
+    config = tyro.cli(CrashesOptions, args=list(argv), prog="rp-jax crashes", description=__doc__)
     with errors.bad_input():
         config.validate()
         errors.needs_matplotlib(config.figures, errors.NO_FIGURES)

@@ -1,6 +1,7 @@
 """Evaluates the agents of a run: returns and crashes, in the world of a test or another.
 
 rp-jax evaluate --run results/RUN --variant N=8
+
 rp-jax evaluate --run results/RUN --set num_obstacles=30 --episodes 2000
 """
 
@@ -19,12 +20,12 @@ from rp_jax.validate import number
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Choice):
-    """What is evaluated; `agent` is not asked for: all are."""
+class EvaluateOptions(Choice):
+    """Options of `rp-jax evaluate`; all agents are evaluated, whatever `agent` is."""
 
     episodes: int = 10_000  # of each agent
     penalty: float = 0.0  # taken off the returns per unit of danger
-    devices: str = "one"  # or "all"
+    devices: str = "one"  # "one", "all" or "cluster"
     out: Path | None = None  # new folder for table.json and table.csv
 
 
@@ -34,7 +35,7 @@ def main(argv: Sequence[str]) -> None:
     Args:
         argv: arguments after "evaluate".
     """
-    config = tyro.cli(Config, args=list(argv), prog="rp-jax evaluate", description=__doc__)
+    config = tyro.cli(EvaluateOptions, args=list(argv), prog="rp-jax evaluate", description=__doc__)
     with errors.bad_input():
         number("episodes", config.episodes, least=1, integer=True)
         found = chosen(config)

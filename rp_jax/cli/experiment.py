@@ -264,8 +264,11 @@ def _whole(experiment: Experiment) -> Callable[[Run, OnProgress], None]:
 
 def _description(experiment: Experiment) -> str:
     presets, recipes = experiment.presets, experiment.recipes
+    resume = "--resume DIR, alone, goes on with an interrupted run."
+    if len(presets) == 1 and len(recipes) == 1:
+        return f"{experiment.about}\n\n{resume}"
     return (
         f"{experiment.about}\n\n--preset {{{','.join(presets)}}} (default {next(iter(presets))}) "
         f"and --recipe {{{','.join(recipes)}}} (default {recipes[0]}) choose the values below; any "
-        "of them can be overridden. --resume DIR, alone, goes on with an interrupted run."
+        f"of them can be overridden. {resume}"
     )

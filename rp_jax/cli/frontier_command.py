@@ -8,16 +8,16 @@ rp-jax frontier --env rp_jax.envs.jam --thresholds .001 .01 .1 --set baseline=pl
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 
 from rp_jax import storage
-from rp_jax.cli import errors, experiment, terminal, train_command
+from rp_jax.cli import experiment, terminal, train_command
 from rp_jax.cli.experiment import Experiment, Run
 from rp_jax.runs import frontier, tables
 from rp_jax.runs.progress import OnProgress
-from rp_jax.runs.train import threat_of
+from rp_jax.runs.train import World, threat_of
 from rp_jax.validate import number
 
 THRESHOLDS = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
@@ -88,25 +88,19 @@ def main(argv: Sequence[str]) -> None:
     Args:
         argv: arguments after "frontier".
     """
-    folder = experiment.to_resume(argv)
-    with errors.bad_input():
-        if folder is not None:
-            world, rest = experiment.world_of(folder), list(argv)
-        else:
-            world, rest = train_command.world_from(argv)
-        base = train_command.config_of(world)
-        kind = dataclasses.make_dataclass(
-            "Config",
-            [("thresholds", tuple[float, ...], dataclasses.field(default=THRESHOLDS))],
-            bases=(type(base),),
-            frozen=True,
-        )
+    world, base, rest = train_command.settings_from(argv)
+    kind = dataclasses.make_dataclass(
+        "Config",
+        [("thresholds", tuple[float, ...], dataclasses.field(default=THRESHOLDS))],
+        bases=(type(base),),
+        frozen=True,
+    )
     experiment.run(
         Experiment(
             name="rp-jax frontier",
-            about=__doc__ or "",
+            about=f"{__doc__}\n{train_command.WORLDS}",
             presets={"default": lambda recipe: kind()},
-            make_world=lambda config: world,
+            make_world=lambda config: cast(World, world),
             job=job,
             recipes=("tuned",),
         ),

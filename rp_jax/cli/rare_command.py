@@ -1,4 +1,4 @@
-"""How rarely does an agent crash, and from where does it crash most?
+"""Estimates how rarely an agent crashes, and finds the starts it crashes from most.
 
 Multilevel splitting against plain episodes of as many steps; then a search for the worst starts.
 
@@ -27,8 +27,8 @@ from rp_jax.streams import Stream, key_of
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(Choice):
-    """What is measured."""
+class RareOptions(Choice):
+    """Options of `rp-jax rare`."""
 
     out: Path  # new folder for the results
     sizes: Annotated[RareConfig, tyro.conf.arg(name="")] = field(default_factory=RareConfig)
@@ -40,7 +40,7 @@ class Config(Choice):
         self.sizes.validate()
 
 
-def known(config: Config, found: Chosen) -> Any:
+def known(config: RareOptions, found: Chosen) -> Any:
     """Returns the starts that were found before; None if there are none.
 
     Args:
@@ -55,7 +55,7 @@ def known(config: Config, found: Chosen) -> Any:
     return rare_events.load_starts(config.starts, found.agents.pmdp, found.about)
 
 
-def run(config: Config, found: Chosen, folder: Path) -> dict[str, Any]:
+def run(config: RareOptions, found: Chosen, folder: Path) -> dict[str, Any]:
     """Measures an agent; writes rare.json and, after a search, the folder worst_starts.
 
     Args:
@@ -120,7 +120,7 @@ def main(argv: Sequence[str]) -> None:
     Args:
         argv: arguments after "rare".
     """
-    config = tyro.cli(Config, args=list(argv), prog="rp-jax rare", description=__doc__)
+    config = tyro.cli(RareOptions, args=list(argv), prog="rp-jax rare", description=__doc__)
     with errors.bad_input():
         config.validate()
         found = chosen(config)

@@ -10,25 +10,36 @@ from rp_jax.cli import terminal
 from rp_jax.cli.experiment import Run
 from rp_jax.runs import ablation, tables, training
 from rp_jax.runs.progress import OnProgress
-from rp_jax.runs.train import threat_of
+from rp_jax.runs.train import TrainConfig, threat_of
 from rp_jax.validate import number, one_of
+
+
+def check(config: TrainConfig) -> None:
+    """Raises ValueError, naming it, if a setting has no place in the comparison.
+
+    To be called before any work, where a run's world is made.
+
+    Args:
+        config: whose threshold is finite, and which has no penalty of its own.
+    """
+    number("x", config.x, least=0)  # finite: there is a shield to compare
+    number("learning_penalty", config.learning_penalty, least=0, most=0)  # it is `penalty`
+    one_of("learning_penalty_from", config.learning_penalty_from, [None])
+    one_of("shield", config.shield, [True])
 
 
 def job(run: Run, bar: OnProgress) -> None:
     """Compares shields in a prepared folder; writes table.json, metrics.jsonl and a figure.
 
     Args:
-        run: whose threshold is finite, and which has no penalty of its own.
+        run: with settings that pass `check`.
         bar: of the progress.
 
     Raises:
         ValueError: a setting has no place in the comparison.
     """
     config = run.config
-    number("x", config.x, least=0)  # finite: there is a shield to compare
-    number("learning_penalty", config.learning_penalty, least=0, most=0)  # it is `penalty`
-    one_of("learning_penalty_from", config.learning_penalty_from, [None])
-    one_of("shield", config.shield, [True])
+    check(config)
     key, params = jax.random.key(0), run.world.params()
     threat = threat_of(key, run.world, config, run.threats, run.folder, run.process, bar)
     agents, table = ablation.compare_shields(

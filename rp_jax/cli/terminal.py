@@ -1,4 +1,4 @@
-"""What is shown on the terminal: lines, tables, and progress with an estimate of the time left."""
+"""Lines, tables, and progress with the time left, shown on the terminal."""
 
 import functools
 import math

@@ -1,13 +1,14 @@
 """Learns threats and agents for a world, and evaluates them, into one folder.
 
 rp-jax train --env rp_jax.envs.jam --set num_obstacles=8 --test N=3:num_obstacles=3
+
 rp-jax train --env my_package.world --out results/mine --seeds 3 --penalty 50
 """
 
 import argparse
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 from rp_jax import recipes
 from rp_jax.cli import errors, experiment
@@ -19,6 +20,11 @@ from rp_jax.runs.train import TrainConfig, World
 from rp_jax.threat.build import ThreatConfig
 
 NAME = "rp-jax train"
+WORLDS = (  # for --help
+    "--env MODULE is the world; --set KEY=VALUE ... are settings of its make_params "
+    "while learning, --test NAME:KEY=VALUE,... those that differ in a test. With --env, --help "
+    "also lists the settings of the threat function of each kind of hazard."
+)
 
 
 def config_of(world: World) -> TrainConfig:
@@ -57,7 +63,7 @@ def world_from(argv: Sequence[str]) -> tuple[World, list[str]]:
     parser.add_argument("--env", required=True)
     parser.add_argument("--set", nargs="*", default=[])
     parser.add_argument("--test", nargs="*", action="extend", default=[])
-    if "--env" not in argv and not any(word.startswith("--env=") for word in argv):
+    if not _names_env(argv):
         raise ValueError("env is missing; it must be a module, such as --env my_package.world")
     found, rest = parser.parse_known_args(list(argv))
     env = imported(found.env)
@@ -78,29 +84,41 @@ def world_from(argv: Sequence[str]) -> tuple[World, list[str]]:
     return world, rest
 
 
+def _names_env(argv: Sequence[str]) -> bool:
+    return any(word == "--env" or word.startswith("--env=") for word in argv)
+
+
+def settings_from(argv: Sequence[str]) -> tuple[World | None, TrainConfig, list[str]]:
+    """Returns the world, its settings, and the other options; exits with 2 on bad input.
+
+    Args:
+        argv: arguments; with --help alone there is no world, and only settings that all have.
+    """
+    folder = experiment.to_resume(argv)
+    with errors.bad_input():
+        if folder is not None:
+            world, rest = experiment.world_of(folder), list(argv)
+        elif set(argv) & {"-h", "--help"} and not _names_env(argv):
+            return None, TrainConfig(), ["--help"]
+        else:
+            world, rest = world_from(argv)
+        return world, config_of(world), rest
+    raise AssertionError  # bad input has ended the program
+
+
 def main(argv: Sequence[str]) -> None:
     """Runs the command.
 
     Args:
         argv: arguments after "train".
     """
-    folder = experiment.to_resume(argv)
-    with errors.bad_input():
-        if folder is not None:
-            world, rest = experiment.world_of(folder), list(argv)
-        else:
-            world, rest = world_from(argv)
-        config = config_of(world)
-    about = (
-        f"{__doc__}\n--env MODULE is the world; --set KEY=VALUE ... are settings of its make_params"
-        " while learning, --test NAME:KEY=VALUE,... those that differ in a test."
-    )
+    world, config, rest = settings_from(argv)
     experiment.run(
         Experiment(
             name=NAME,
-            about=about,
+            about=f"{__doc__}\n{WORLDS}",
             presets={"default": lambda recipe: config},
-            make_world=lambda config: world,
+            make_world=lambda config: cast(World, world),
             recipes=("tuned",),
         ),
         rest,

@@ -26,20 +26,20 @@ from rp_jax.validate import finite, none_bad, number, one_of, random_key
 class LoopConfig:
     """Sizes and schedules of the loop."""
 
-    network: str = "tuned"
+    network: str = "tuned"  # or "paper"
     learner: DQNConfig = field(default_factory=DQNConfig)
     steps: int = 1_200_000  # agent steps in all
-    num_envs: int = 256
-    batch: int = 1024
+    num_envs: int = 256  # environments that step side by side
+    batch: int = 1024  # replayed transitions per update
     updates: int = 1  # per step of all environments
-    n_step: int = 3
+    n_step: int = 3  # rewards in a learning target
     replay: int = 200_000  # transitions kept
-    replay_start: int = 5_000
-    prioritised: bool = False
-    priority_exponent: float = 0.6
-    importance: float = 0.4  # rises to 1 at the end
-    explore_from: float = 1.0
-    explore_to: float = 0.05
+    replay_start: int = 5_000  # transitions kept before learning begins
+    prioritised: bool = False  # replay transitions with large errors more often
+    priority_exponent: float = 0.6  # of the errors, if prioritised
+    importance: float = 0.4  # exponent of the importance weights; rises to 1 at the end
+    explore_from: float = 1.0  # probability of a random admissible action, at first
+    explore_to: float = 0.05  # the same after `explore_share` of the steps
     explore_share: float = 0.3  # of the steps, over which exploration falls
 
     def validate(self, name: str) -> None:
@@ -82,7 +82,7 @@ class LoopConfig:
 
 
 class Metrics(NamedTuple):
-    """Sums over a chunk of iterations; divide by `episodes` or `steps`."""
+    """Sums over a chunk of iterations, to be divided by `episodes` or `steps`."""
 
     steps: Array
     episodes: Array
@@ -94,12 +94,12 @@ class Metrics(NamedTuple):
     inadmissible: Array  # actions taken whose threat exceeds x though others' did not
     loss: Array
     bad_observations: Array  # states seen with a number that is nan or infinite
-    bad_threats: Array  # likewise
-    bad_rewards: Array  # steps
+    bad_threats: Array  # states with a threat that is nan or infinite
+    bad_rewards: Array  # steps with a reward that is nan or infinite
 
 
 class Seen(NamedTuple):
-    """What is kept of looking at a batch of states."""
+    """Observations and threats of the states that the environments are in."""
 
     encoded: Encoded  # (B,)
     threat: Array  # (B, A)
@@ -109,7 +109,7 @@ class Seen(NamedTuple):
 
 
 class LoopState(NamedTuple):
-    """Carried through training."""
+    """All that training carries from one iteration to the next."""
 
     states: Any  # (B,) environment states
     seen: Seen  # of those states
@@ -122,18 +122,31 @@ class LoopState(NamedTuple):
 
 
 def make_network(config: LoopConfig, pmdp: PMDP) -> nn.Module:
-    """The Q-network that the configuration names."""
+    """Returns the Q-network that the configuration names.
+
+    Args:
+        config: of the loop.
+        pmdp: whose actions and observations it is for.
+    """
     num_actions = optional.num_actions(pmdp.env, pmdp.params)
     return NETWORKS[config.network](num_actions=num_actions, scale=optional.scale(pmdp.env))
 
 
 def make_optimiser(config: LoopConfig) -> optax.GradientTransformation:
-    """Adam over the whole run."""
+    """Returns the optimiser of the whole run, Adam.
+
+    Args:
+        config: of the loop.
+    """
     return dqn.optimiser(config.learner, config.iterations * config.updates)
 
 
 def make_replay(config: LoopConfig) -> Any:
-    """A flashbax buffer of single transitions, uniform or prioritised."""
+    """Returns a flashbax buffer of single transitions, uniform or prioritised.
+
+    Args:
+        config: of the loop.
+    """
     sizes = {
         "max_length": config.replay,
         "min_length": max(config.replay_start, config.num_envs),
@@ -147,7 +160,12 @@ def make_replay(config: LoopConfig) -> Any:
 
 
 def exploration(iteration: Array, config: LoopConfig) -> Array:
-    """() epsilon, falling linearly."""
+    """Returns the probability of exploring, which falls linearly.
+
+    Args:
+        iteration: () steps of all environments so far.
+        config: of the loop.
+    """
     span = max(1.0, config.explore_share * config.iterations)
     done = jnp.clip(iteration / span, 0.0, 1.0)
     return config.explore_from + done * (config.explore_to - config.explore_from)
@@ -171,7 +189,18 @@ def _look(pmdp: PMDP, states: Any) -> Seen:
 def interact(
     key: Array, state: LoopState, pmdp: PMDP, network: nn.Module, config: LoopConfig
 ) -> tuple[LoopState, Metrics]:
-    """Every environment takes one step; the window moves on; nothing is learned."""
+    """Takes one step of every environment, and learns nothing.
+
+    Args:
+        key: of the actions and the environments.
+        state: of the loop.
+        pmdp: the environment, the threats and the threshold.
+        network: of the action values.
+        config: of the loop.
+
+    Returns:
+        The state with its windows moved on by a step, and the metrics of the step.
+    """
     choose_key, step_key = jax.random.split(key)
     batch = config.num_envs
     values = jnp.asarray(network.apply(state.learner.params, state.seen.encoded))
@@ -225,7 +254,12 @@ def _inadmissible(seen: Seen, action: Array) -> Array:
 
 
 def begin(key: Array, pmdp: PMDP, config: LoopConfig) -> LoopState:
-    """All environments at a start, a fresh learner, and nothing in the replay.
+    """Returns all environments at a start, a fresh learner, and nothing in the replay.
+
+    Args:
+        key: of everything random in training.
+        pmdp: the environment, the threats and the threshold.
+        config: of the loop.
 
     Raises:
         ValueError: a setting is out of range.
@@ -257,7 +291,13 @@ def begin(key: Array, pmdp: PMDP, config: LoopConfig) -> LoopState:
 
 
 def init(key: Array, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics]:
-    """Returns `begin` with a replay filled by real steps, and the metrics of these."""
+    """Returns `begin` with a replay filled by real steps, and the metrics of these.
+
+    Args:
+        key: of everything random in training.
+        pmdp: the environment, the threats and the threshold.
+        config: of the loop.
+    """
     state, opening = begin(key, pmdp, config), None
     if config.opening:
         state, opening = chunk(state, pmdp, config, config.opening, updates=0)
@@ -283,7 +323,16 @@ def _oldest(window: Taken, config: LoopConfig) -> Transition:
 
 
 def collect(state: LoopState, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics]:
-    """Act, step, look, store: one step of every environment."""
+    """Takes one step of every environment, and stores the transitions.
+
+    Args:
+        state: of the loop.
+        pmdp: the environment, the threats and the threshold.
+        config: of the loop.
+
+    Returns:
+        The state after, and the metrics of the step.
+    """
     key, act_key = jax.random.split(state.key)
     network = make_network(config, pmdp)
     state, metrics = interact(act_key, state, pmdp, network, config)
@@ -292,7 +341,17 @@ def collect(state: LoopState, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState
 
 
 def learn(key: Array, state: LoopState, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Array]:
-    """Sample and update once; returns the loss."""
+    """Updates the network once, from a sample of the replay.
+
+    Args:
+        key: of the sample.
+        state: of the loop.
+        pmdp: the environment, the threats and the threshold.
+        config: of the loop.
+
+    Returns:
+        The state after, and the loss, ().
+    """
     network, replay = make_network(config, pmdp), make_replay(config)
     sample = replay.sample(state.replay, key)
     weights = jnp.ones(config.batch)
@@ -318,10 +377,19 @@ def chunk(
     iterations: int | Array,
     updates: int | Array | None = None,
 ) -> tuple[LoopState, Metrics]:
-    """`iterations` of: collect, then learn `updates` times. Metrics are summed.
+    """Collects and learns, several times.
 
-    None stands for `config.updates`; it may be fewer. Where both numbers are traced, one compiled
-    program fills the replay (0 updates) and learns.
+    Where both numbers are traced, one compiled program fills the replay (0 updates) and learns.
+
+    Args:
+        state: of the loop.
+        pmdp: the environment, the threats and the threshold.
+        config: of the loop.
+        iterations: steps of every environment.
+        updates: per iteration; at most, and by default, `config.updates`.
+
+    Returns:
+        The state after, and the sums of the metrics.
     """
     if isinstance(iterations, int):
         number("iterations", iterations, least=1, integer=True)
@@ -348,6 +416,10 @@ def check(params: Any, metrics: Metrics) -> None:
     """Raises FloatingPointError if something in a chunk was not a finite number, naming it.
 
     The weights tell of gradients: Adam never forgets one that is not finite.
+
+    Args:
+        params: weights of the network.
+        metrics: of the chunk.
     """
     none_bad("planning", metrics)
     finite("planning: losses", metrics.loss)

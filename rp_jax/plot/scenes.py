@@ -43,6 +43,13 @@ class Episode(NamedTuple):
     hit: np.ndarray  # (t,) bool, the step that led here met danger
 
 
+class Pose(NamedTuple):
+    """Where a body is, and which way it looks."""
+
+    position: Sequence[float]  # (2,) room units
+    heading: Sequence[float]  # (2,) unit vector; nan where it has none
+
+
 class Path2D(NamedTuple):
     """The part of an episode that `trajectories` draws."""
 
@@ -74,6 +81,30 @@ def draw_scene(axis: Any, scene: Scene) -> None:
     axis.set_aspect("equal")
     axis.set_xticks([])
     axis.set_yticks([])
+
+
+def picture(scene: Scene, bodies: Sequence[Pose], path: Path, width: float = 2.0) -> None:
+    """Draws one moment of a world, small.
+
+    Args:
+        scene: everything that stands still.
+        bodies: who is where; the first one is the agent's.
+        path: where to write the PNG.
+        width: of the picture, inches.
+    """
+    low, high = scene.walls.min(axis=0) - 0.05, scene.walls.max(axis=0) + 0.05
+    shape = float((high - low)[1] / (high - low)[0])
+    figure, axis = plt.subplots(figsize=(width, width * shape), layout="constrained")
+    draw_scene(axis, scene)
+    axis.axis("off")
+    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    colours = [AGENT, *(scene.colours or [OBSTACLE] * (len(bodies) - 1))]
+    for body, colour in zip(bodies, colours, strict=True):
+        axis.add_patch(Circle(body.position, scene.radius, color=colour, zorder=4))
+        tip = np.asarray(body.position) + 1.8 * scene.radius * np.asarray(body.heading)
+        axis.plot(*np.stack([body.position, tip]).T, color="black", linewidth=1.2, zorder=5)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
 
 
 def trajectories(

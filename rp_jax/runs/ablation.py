@@ -1,4 +1,4 @@
-"""The same learner without a shield, without one but penalised, and with it, side by side."""
+"""Comparison of one learner without a shield, penalised instead, and with a shield."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -20,7 +20,7 @@ from rp_jax.threat.function import ThreatFunction
 
 
 class Member(NamedTuple):
-    """What sets one of several agents that learn side by side apart."""
+    """Number, threshold and penalty of one of several agents that learn side by side."""
 
     seed: int  # its number
     x: float  # threshold of admissible threat

@@ -22,7 +22,7 @@ POWER = 0.9  # of the test, at the expected crash rate
 
 @dataclass(frozen=True)
 class Certificate:
-    """What a planned number of episodes shows of an agent's crash rate."""
+    """Result of testing whether an agent's crash rate is at most c."""
 
     env: str
     method: str

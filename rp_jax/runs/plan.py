@@ -236,7 +236,7 @@ def _finished(
 
 
 class Learner(NamedTuple):
-    """What learns, in what, and how its progress is told."""
+    """Agents that learn side by side, their world, and where their progress is told."""
 
     pmdp: PMDP
     members: Sequence[Member]

@@ -152,7 +152,6 @@ def learn_policies(
             where,
             on_progress,
             on_metrics,
-            stage=method,
         )
         policies = _learned(keys, policies, steps, learners, checkpoints)
         if where is not None:
@@ -212,7 +211,7 @@ def _learned(
         counted = actor_critic.Metrics._fields
         return {key: value / length for key, value in sums.items() if key not in counted}
 
-    learners.on_progress(name, 0, chunks, "compiling")
+    learners.on_progress(learners.stage, 0, chunks, "compiling")
     began = time.perf_counter()
     state = jax.jit(_starting(policies))(keys, pmdp)
     c = jnp.asarray(policies.c, pmdp.x.dtype)

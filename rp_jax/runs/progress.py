@@ -10,4 +10,8 @@ OnMetrics = Callable[[Mapping[str, Any]], None]
 
 
 def silent(*_: Any) -> None:
-    """Tells nothing."""
+    """Does nothing, in place of a callback.
+
+    Args:
+        *_: not used.
+    """

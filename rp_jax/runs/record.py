@@ -1,4 +1,4 @@
-"""What a job depends on, kept beside its checkpoints: it goes on only where that is the same."""
+"""Facts that a job depends on, kept beside its checkpoints: it resumes only where they agree."""
 
 import contextlib
 import functools
@@ -62,7 +62,11 @@ def name_of(env: Any) -> str:
 
 
 def source_of(env: Any) -> Path | None:
-    """Returns the folder with the source of an environment that is not the library's own."""
+    """Returns the folder with the source of an environment that is not the library's own.
+
+    Args:
+        env: a module, or an object.
+    """
     module = env if hasattr(env, "__file__") else sys.modules.get(type(env).__module__)
     file = getattr(module, "__file__", None)
     if file is None or Path(file).is_relative_to(Path(rp_jax.__file__).parent):
@@ -116,8 +120,8 @@ def compared(where: str, found: Mapping[str, Any], wanted: Mapping[str, Any]) ->
 
     Args:
         where: for the message, such as "folder is results/mine".
-        found: as it was kept.
-        wanted: as it is.
+        found: facts as they were kept.
+        wanted: facts as they are.
     """
     for name, value in wanted.items():
         if found.get(name) != value:
@@ -191,5 +195,9 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def key_data(key: jax.Array) -> list[int]:
-    """Returns the words of a key, to be kept in a file."""
+    """Returns the words of a key, to be kept in a file.
+
+    Args:
+        key: a typed key.
+    """
     return np.asarray(jax.random.key_data(key)).ravel().tolist()

@@ -297,8 +297,8 @@ def _parameters(folder: Path, env: Any, about: Mapping[str, Any]) -> Any:
     facts = about.get("params")
     if not isinstance(facts, dict):
         raise storage.StorageError(
-            f"{where}: the parameters were not made by make_params alone; they must be given: "
-            "load(folder, env, params)"
+            f"{where}: the parameters cannot be made anew, since the settings of make_params were "
+            "not given when they were saved; they must be given: load(folder, env, params)"
         )
     made = _made(env, about.get("settings") or {}, where)
     claimed = _claimed(folder)

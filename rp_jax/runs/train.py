@@ -53,7 +53,7 @@ class World(NamedTuple):
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """What a run's results depend on, beside the world and its threat functions."""
+    """Settings that a run's results depend on, beside its world and threat functions."""
 
     seeds: int = 1  # agents, side by side in one program
     seed: int = 0  # number of the first; the others count up
@@ -88,7 +88,7 @@ class Process:
 
     out: Path | None = None  # folder for results; default: results/WORLD-TIME
     threat: Path | None = None  # folder of a threat function to use again
-    devices: str = "one"  # "all": agents side by side on every device; "cluster": of every process
+    devices: str = "one"  # "one"; "all": agents on every device; "cluster": of every process
     figures: bool = True  # draw figures; needs matplotlib
 
 

@@ -17,7 +17,7 @@ CHUNKS = 30  # of a training run: points of its curves
 
 
 class Learners(NamedTuple):
-    """What learns side by side, and how its progress is told."""
+    """Learners that train side by side, and where their progress is told."""
 
     members: Sequence[Member]
     names: Sequence[str]  # of their methods
@@ -30,7 +30,7 @@ class Learners(NamedTuple):
 
 
 class Tape(NamedTuple):
-    """What happened in each chunk."""
+    """Sums over each chunk of training."""
 
     metrics: dict[str, np.ndarray]  # (chunks, members) sums, by name
     seconds: np.ndarray  # (chunks,) since the beginning, interruptions left out

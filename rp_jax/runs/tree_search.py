@@ -70,7 +70,7 @@ def evaluate_search(
     with record.job(where, "MPC", spec) as checkpoints:
         for test, search in searches.items():
             own = key_of(key, Stream.SEARCH)
-            at, stage = checkpoints.at(test or "all"), f"{method_name(search)} {test}".strip()
+            at, stage = checkpoints.at(test or "all"), f"search {test}".strip()
             found, seconds = play_search(own, search, episodes, stage, on_progress, at)
             evaluation.check(found, stage)
             alone = time_search(key, search)
@@ -109,7 +109,7 @@ def play_search(
     key: Array,
     search: Search,
     episodes: int,
-    stage: str = "MPC",
+    stage: str = "search",
     on_progress: OnProgress = silent,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> tuple[evaluation.Episodes, float]:

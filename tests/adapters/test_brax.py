@@ -262,8 +262,8 @@ def test_what_jax_took_away_is_back():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", ["ppo", "sac"])
-def test_agents_of_brax_train(body):
-    if body == "ppo":
+def test_agents_of_brax_train(agent):
+    if agent == "ppo":
         from brax.training.agents.ppo.train import train
 
         settings = {"batch_size": 16, "num_minibatches": 4, "unroll_length": 8}

@@ -25,9 +25,8 @@ from benchmarks import (
 )
 from benchmarks.bound import Bound, Piece, Work
 from benchmarks.measure import Row
-from experiments import circuit, jam, point_gather
-
-MODULES = {"circuit": circuit, "jam": jam, "point_gather": point_gather}
+from experiments.tasks import EXPERIMENTS
+from rp_jax.cli.experiment import threats_of
 
 HERE = ["--processes", "1"]
 LIMITS = bound.Limits(operations=1e11, bytes=1e10)
@@ -263,31 +262,39 @@ def test_the_program_of_steps_takes_them(observed):
     sane(measure.measure("probe", "steps", 4, 400, program, start, jax.random.key(1), params))
 
 
-def tiny_tasks(modules=(jam,)):
+def tiny_tasks(names=("jam",)):
     """Tasks with networks and batches as small as they may be."""
     found = {}
-    for module in modules:
+    for name in names:
+        module = EXPERIMENTS[name]
         config = module.quick("tuned")
         small = lambda threat: dataclasses.replace(  # noqa: E731
             threat, fit=dataclasses.replace(threat.fit, hidden=(4,), batch=16)
         )
-        kinds = {kind: small(getattr(config, kind)) for kind in module.make_task(config).threats}
+        kinds = {kind: small(threat) for kind, threat in threats_of(config).items()}
         planning = dataclasses.replace(
             config.planning, num_envs=4, batch=8, replay=64, replay_start=8, n_step=1
         )
         config = dataclasses.replace(config, planning=planning, **kinds)
-        task = module.make_task(config)
-        found[task.name] = (task, config)
+        found[name] = (module.make_world(config), config)
     return found
 
 
 def test_the_setups_are_the_tuned_recipes():
     found = setups.quick_tasks()
-    assert set(found) == set(MODULES)
-    for module in MODULES.values():
-        task, config = found[module.__name__.split(".")[-1]]
-        assert config == module.quick("tuned")
-        assert set(task.threats) == set(task.env.sub_rmdps(task.train))
+    assert list(found) == list(EXPERIMENTS)
+    for name, (world, config) in found.items():
+        assert world.name == name
+        assert config == EXPERIMENTS[name].quick("tuned")
+        assert set(threats_of(config)) == set(world.env.sub_rmdps(world.params()))
+
+
+def test_a_setup_has_a_model_of_each_kind_of_hazard():
+    world, config = tiny_tasks()["jam"]
+    pmdp = setups.pmdp_of(world, config)
+    assert set(pmdp.threats) == {"obstacle", "wall"}
+    assert pmdp.shielded
+    assert 0 < float(pmdp.x) <= config.x
 
 
 @pytest.mark.slow

@@ -53,7 +53,7 @@ def test_settings_of_the_wrong_type_are_named(field, value, kind):
 
 def test_a_setting_that_has_no_default_is_missed():
     with pytest.raises(storage.StorageError, match=r"^file: c is missing; it must be there"):
-        dataclass_json.restored(certify_command.Config, {"run": "a"}, "file")
+        dataclass_json.restored(certify_command.CertifyOptions, {"run": "a"}, "file")
 
 
 def test_a_run_comes_back_with_the_agents_that_its_table_speaks_of(finished):
@@ -159,7 +159,7 @@ SIZES = RareConfig(particles=20, repeats=3, generations=2, population=20, tries=
 
 def test_rare_events_and_worst_starts_of_a_run(drawn, tmp_path):
     found, out = chosen(Choice(run=drawn)), storage.new_folder(tmp_path / "rare")
-    config = rare_command.Config(run=drawn, out=out, sizes=SIZES)
+    config = rare_command.RareOptions(run=drawn, out=out, sizes=SIZES)
     row = rare_command.run(config, found, out)
     assert json.loads((out / "rare.json").read_text())["estimate"] == pytest.approx(row["estimate"])
     if row["estimate"] > 0:
@@ -191,7 +191,7 @@ def test_the_agent_that_comes_with_the_project_still_survives_its_worst_starts(t
     recorded = json.loads((KEPT / "rare" / "rare.json").read_text())
     before = np.asarray([[s["crashes"], s["episodes"]] for s in recorded["worst_starts"]])
     folder = storage.new_folder(tmp_path / "again")
-    config = rare_command.Config(
+    config = rare_command.RareOptions(
         run=KEPT / "jam_ahead",
         out=folder,
         variant=recorded["variant"],

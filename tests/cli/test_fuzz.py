@@ -5,6 +5,7 @@ RP_FUZZ sets the number of examples of the slow part.
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 import json
 import os
@@ -25,19 +26,17 @@ from experiments import (
     mpc,
     patrol,
     point_gather,
+    resumable,
     sampling,
     shielded,
     theorems,
 )
 from rp_jax import storage
-from rp_jax.cli import (
-    certify_command,
-    crashes_command,
-    evaluate_command,
-    experiment,
-    main,
-    rare_command,
-)
+from rp_jax.cli import experiment, main
+from rp_jax.cli.certify_command import CertifyOptions
+from rp_jax.cli.crashes_command import CrashesOptions
+from rp_jax.cli.evaluate_command import EvaluateOptions
+from rp_jax.cli.rare_command import RareOptions
 from rp_jax.runs import dataclass_json, train
 from rp_jax.runs.train import Process
 
@@ -48,17 +47,39 @@ MODULES = {
     "patrol": patrol,
     "frontier": frontier,
 }
-OTHERS = {  # with a command line of their own
-    module.__name__.rpartition(".")[2]: module
-    for module in (everything, compare, frozen_lake, mpc, sampling, shielded, theorems)
+OTHERS = {  # modules with a command line of their own, and what it needs
+    everything: [],
+    compare: ["--env", "jam"],
+    frozen_lake: [],
+    mpc: ["--env", "jam", "--horizon", "2"],
+    sampling: [],
+    shielded: [],
+    theorems: [],
 }
-COMMANDS = {  # of rp-jax, with what they need
-    "certify": (certify_command, ["--run", "nowhere", "--c", "0.1"]),
-    "crashes": (crashes_command, ["--run", "nowhere", "--out", "there"]),
-    "evaluate": (evaluate_command, ["--run", "nowhere"]),
-    "rare": (rare_command, ["--run", "nowhere", "--out", "there"]),
-    "train": (None, ["--env", "rp_jax.envs.circuit"]),
-    "check": (None, ["--env", "no_such_world"]),
+COMMANDS = {  # of rp-jax: their options, and what they need
+    "certify": (CertifyOptions, ["--run", "nowhere", "--c", "0.1"]),
+    "crashes": (CrashesOptions, ["--run", "nowhere", "--out", "there"]),
+    "evaluate": (EvaluateOptions, ["--run", "nowhere"]),
+    "rare": (RareOptions, ["--run", "nowhere", "--out", "there"]),
+    "train": (Process, ["--env", "rp_jax.envs.circuit"]),
+    "check": (Process, ["--env", "no_such_world"]),
+}
+
+
+def called(module):
+    """Runs a module's command line on the arguments of the process."""
+    if hasattr(module, "COMMAND"):
+        resumable.main(module.COMMAND, sys.argv[1:])
+    else:
+        module.main()
+
+
+LINES = {  # by name: (function, its options, what it needs)
+    **{
+        module.__name__.rpartition(".")[2]: (functools.partial(called, module), module.Config, need)
+        for module, need in OTHERS.items()
+    },
+    **{name: (main.main, options, need) for name, (options, need) in COMMANDS.items()},
 }
 PATIENCE = 300  # seconds for one example, on a machine that is busy
 MANY = int(os.environ.get("RP_FUZZ", "100"))  # a refused command line takes 70 ms, a good one 440
@@ -139,21 +160,17 @@ def call(name, argv):
 
 
 def call_other(name, argv):
-    if name in COMMANDS:
-        ends_well(lambda: main.main([name, *argv]), argv)
-        return
+    words = [name, *argv]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", [name, *argv])
-        ends_well(OTHERS[name].main, argv)
+        patch.setattr(sys, "argv", ["rp-jax", *words] if name in COMMANDS else words)
+        ends_well(LINES[name][0], argv)
 
 
 def words_of(name):
-    """Command lines of one of the others, most of them with what it needs."""
-    module, needed = COMMANDS.get(name, (OTHERS.get(name), []))
-    if name in ("compare", "mpc"):
-        needed = ["--env", "jam", *(["--horizon", "2"] if name == "mpc" else [])]
-    fields = dataclasses.fields(module.Config) if module else ()
-    names = [*(f.name.replace("_", "-") for f in fields), "resume", "set", "test", "x"]
+    """Command lines of one of them, most of them with what it needs."""
+    _, options, needed = LINES[name]
+    fields = [field.name.replace("_", "-") for field in dataclasses.fields(options)]
+    names = [*fields, "resume", "set", "test", "x"]
     option = st.tuples(st.sampled_from(names).map("--{}".format), values).map(list)
     parts = st.lists(option | stray, max_size=3).map(lambda parts: [*itertools.chain(*parts)])
     return st.tuples(st.just(name), st.sampled_from([needed, []]), parts).map(
@@ -187,13 +204,13 @@ def read_back(name, changed):
 
 
 class TestOtherCommandLines:
-    @given(st.sampled_from(sorted([*OTHERS, *COMMANDS])).flatmap(words_of))
+    @given(st.sampled_from(sorted(LINES)).flatmap(words_of))
     @settings(max_examples=40)
     def test_some(self, nothing_runs, found):
         call_other(*found)
 
     @pytest.mark.slow
-    @given(st.sampled_from(sorted([*OTHERS, *COMMANDS])).flatmap(words_of))
+    @given(st.sampled_from(sorted(LINES)).flatmap(words_of))
     @settings(max_examples=MANY)
     def test_many(self, nothing_runs, found):
         call_other(*found)

@@ -834,8 +834,10 @@ def obstacles_that_are_not_listed():
 
 @mutant("static hazards", r"step of the source of 'pedestrian' moves the hazard in .* `static` is")
 def pedestrians_that_are_said_to_stand():
-    params = crossing.make_params()
-    return crossing, params.replace(pedestrian=params.pedestrian.replace(static=True))
+    class Pedestrian(crossing.Pedestrian):
+        static = True
+
+    return with_pedestrian(Pedestrian)
 
 
 @mutant("static hazards", r"step moves hazards of kind 'parked', or takes them away, in")
@@ -910,7 +912,7 @@ def test_the_whole_check_names_what_is_wrong_with_a_mutant(name):
     with pytest.raises(EnvError) as error:
         check_env(*make())
     assert any(re.search(sentence, problem) for problem in error.value.problems), error.value
-    assert len(error.value.problems) < 7
+    assert len(error.value.problems) < 10
     assert not any("could not be" in problem for problem in error.value.problems)
 
 
@@ -940,9 +942,10 @@ def test_there_is_no_false_alarm_over_twenty_seeds(name):
                     assert check(trial) == [], (seed, what)
 
 
-def test_every_sound_world_has_a_sound_structure():
-    for env, make in SOUND.values():
-        assert check_contract(env, make()) is None
+@pytest.mark.parametrize("name", ["jam", "jam-plans", "circuit-plans", "point_gather"])
+def test_a_sound_world_has_a_sound_structure(name):
+    env, make = SOUND[name]
+    assert check_contract(env, make()) is None
 
 
 class World:

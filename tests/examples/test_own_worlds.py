@@ -13,8 +13,8 @@ from tiny import TINY, TINY_THREAT, moment
 from examples.crossing import run as crossing
 from examples.trolley import run as trolley
 from examples.trolley import world
-from experiments import ablation
 from rp_jax.adapters import physics
+from rp_jax.cli import experiment, main
 from rp_jax.recon import labels, sampling
 
 ROOT = Path(__file__).parents[2]
@@ -45,16 +45,16 @@ def test_the_page_shows_the_code_that_is_tested():
 def test_a_world_of_ones_own_goes_all_the_way(module, kinds, options, variants, tmp_path):
     out = tmp_path / "results"
     argv = " ".join([TINY, "--seeds 1", options, *map(TINY_THREAT.format, kinds)]).split()
-    name, about = module.__name__, module.__doc__
-    presets, make = {"quick": module.quick}, module.make_task
     with moment():
-        ablation.main(name, about, presets, make, [*argv, "--out", str(out)])
+        experiment.run(module.EXPERIMENT, [*argv, "--out", str(out)])
     rows = json.loads((out / "table.json").read_text())
     assert len({row["variant"] for row in rows}) == variants
     assert len(rows) == variants * 5  # at random twice, two DQNs, RP
     assert {row["x"] for row in rows} == {"inf", 0.9}
     assert all(set(row["collisions"]) == set(kinds) for row in rows)
     assert (out / "learning_curves.png").stat().st_size > 1000
+    with moment():  # and its agents are loaded and tested by the commands
+        main.main(["certify", "--run", str(out), "--c", "0.95", "--expected", "0.5"])
 
 
 @functools.cache

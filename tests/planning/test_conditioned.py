@@ -41,11 +41,26 @@ def test_what_is_admissible_is_what_is_admissible_at_that_threshold(x):
     plain = jax.jit(type(pmdp).perceive)(pmdp, states)
     wrapped, marked = at(pmdp, states, x)
     found = jax.jit(type(wrapped).perceive)(wrapped, marked)
-    assert (np.asarray(found.admissible) <= np.asarray(plain.admissible))[plain.secure].all()
-    near = np.abs(np.asarray(plain.threat) / x - 1) < 1e-6  # may be rounded up
-    np.testing.assert_array_equal(found.admissible[~near.any(1)], plain.admissible[~near.any(1)])
-    np.testing.assert_allclose(found.threat * x, plain.threat, rtol=1e-5)
+    np.testing.assert_array_equal(found.admissible, plain.admissible)
+    np.testing.assert_array_equal(found.secure, plain.secure)
+    np.testing.assert_array_equal(found.threat, plain.threat)
+    np.testing.assert_array_equal(found.threshold, np.full(200, np.float32(x)))
+    np.testing.assert_array_equal(plain.threshold, found.threshold)
     assert 0 < np.asarray(plain.admissible).mean() < 1
+
+
+def test_each_state_is_judged_by_the_threshold_of_its_own_episode():
+    pmdp = jam_pmdp(0.5)
+    states = jax.vmap(jam.reset, (0, None))(jax.random.split(jax.random.key(0), 60), pmdp.params)
+    xs = jnp.asarray(np.tile(XS, 20), jnp.float32)
+    wrapped = conditioned.condition(pmdp, 0.05, 0.9)
+    found = jax.jit(type(wrapped).perceive)(wrapped, conditioned.State(states, xs))
+    np.testing.assert_array_equal(found.threshold, xs)
+    within = np.asarray(found.threat) <= np.asarray(xs)[:, None]
+    np.testing.assert_array_equal(found.secure, within.any(axis=1))
+    secure = np.asarray(found.secure)
+    np.testing.assert_array_equal(found.admissible[secure], within[secure])
+    assert 0 < within[:, 0].mean() < 1
 
 
 def test_without_a_shield_all_is_admissible_at_any_threshold():

@@ -391,9 +391,8 @@ def test_the_carried_view_is_that_of_the_carried_states():
     ],
 )
 def test_an_inadmissible_action_is_known_by_its_threat(threat, action, x, wrong):
-    found = loop._inadmissible(
-        jnp.asarray([threat, threat]), jnp.asarray([action, action]), jnp.asarray(x)
-    )
+    seen = loop.Seen(None, jnp.asarray([threat, threat]), None, None, jnp.asarray([x, x]))
+    found = loop._inadmissible(seen, jnp.asarray([action, action]))
     np.testing.assert_array_equal(found, [wrong, wrong])
 
 

@@ -1,5 +1,6 @@
 """Crashes looked at closely, on the corridor: what was risked and missed there is known."""
 
+import dataclasses
 import json
 
 import jax
@@ -8,11 +9,14 @@ import numpy as np
 import probe
 import pytest
 
-from experiments import crashes
-from experiments.crashes import Config
+from rp_jax.cli import crashes_command
 from rp_jax.planning.pmdp import PMDP
+from rp_jax.recording import Recording
+from rp_jax.runs import crashes
+from rp_jax.runs.agents import Agent
+from rp_jax.runs.crashes import CrashConfig
 
-SIZES = {"episodes": 50, "most": 4, "steps": 3, "tries": 32, "checks": 400}
+SIZES = CrashConfig(episodes=50, most=4, steps=3, tries=32, checks=400)
 
 
 class Careless(PMDP):
@@ -30,17 +34,19 @@ def make_careless(x=0.1):
     return Careless(**{**fields, "x": jnp.asarray(x, jnp.float32)})
 
 
-def rightwards(percept):
-    return jnp.tile(jnp.asarray([[0.0, 0.0, 1.0]]), (percept.secure.shape[0], 1))
+class Eager(Agent):
+    """Goes to the right whenever it may."""
+
+    def values(self, percept):
+        return jnp.tile(jnp.asarray([[0.0, 0.0, 1.0]]), (percept.secure.shape[0], 1))
 
 
-def config(tmp_path, **changes):
-    return Config(**{"run": tmp_path, "out": tmp_path / "out", **SIZES, **changes})
+def eager(x):
+    return Eager(pmdp=make_careless(x), weights=None, network=None)
 
 
-def test_each_crash_has_its_last_steps(tmp_path):
-    pmdp = make_careless(x=1.0)  # walks into the pit
-    found, count, episodes = crashes.found(jax.random.key(0), pmdp, rightwards, config(tmp_path))
+def test_each_crash_has_its_last_steps():
+    found, count, episodes = crashes.found(jax.random.key(0), eager(1.0), SIZES)
     assert len(found) == 4
     assert episodes == 50
     assert 4 < count <= 50
@@ -56,12 +62,12 @@ def test_each_crash_has_its_last_steps(tmp_path):
         assert crash.threat.shape == (min(3, crash.length), 3)
 
 
-def test_what_was_risked_and_what_was_missed(tmp_path):
-    pmdp, settings = make_careless(x=1.0), config(tmp_path)
-    found, _, _ = crashes.found(jax.random.key(0), pmdp, rightwards, settings)
+def test_what_was_risked_and_what_was_missed():
+    agent = eager(1.0)  # walks into the pit
+    found, _, _ = crashes.found(jax.random.key(0), agent, SIZES)
     crash = next(crash for crash in found if crash.length >= 3)
-    explore = crashes.explorer(pmdp, rightwards, settings)
-    rows = crashes.looked_at(jax.random.key(1), crash, explore, settings)
+    explore = crashes.explorer(agent.pmdp, agent.values, SIZES)
+    rows = crashes.looked_at(jax.random.key(1), crash, explore, SIZES)
     assert [row["before"] for row in rows] == [3, 2, 1]
     last = rows[-1]
     # Going right falls in with .8 at once; else it tries again until the time is up.
@@ -78,7 +84,7 @@ def test_what_was_risked_and_what_was_missed(tmp_path):
     assert all(row["seems_to_save"] >= 0 for row in rows)
 
 
-def test_steps_without_an_admissible_action_are_counted(tmp_path):
+def test_steps_without_an_admissible_action_are_counted():
     pmdp = make_careless(x=0.1)  # at cell 5 nothing is admissible, and the least threat is to stay
     states = jax.vmap(probe.start_at)(jnp.asarray([5.0]))
     percept = jax.jit(pmdp.perceive)(states)
@@ -89,7 +95,7 @@ def test_steps_without_an_admissible_action_are_counted(tmp_path):
         "threat": np.zeros((5, 1, 3)),
         "states": jax.tree.map(lambda a: np.zeros((5, 1)), states),
     }
-    recording = crashes.evaluate.Recording(admissible=None, alive=None, **shown)
+    recording = Recording(admissible=None, alive=None, **shown)
     crash = crashes.ending(recording, 0, 4, 3, ["pit"])
     assert (crash.length, crash.insecure) == (4, 2)
     np.testing.assert_array_equal(crash.secure, [True, False, False])
@@ -105,32 +111,33 @@ def test_steps_without_an_admissible_action_are_counted(tmp_path):
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [
-        ("episodes", 0),
-        ("most", 0),
-        ("steps", 101),
-        ("tries", 0),
-        ("checks", 1.5),
-        ("agent", -1),
-        ("seed", -1),
-    ],
+    [("episodes", 0), ("most", 0), ("steps", 101), ("tries", 0), ("checks", 1.5)],
 )
-def test_bad_settings_are_named(field, value, tmp_path):
-    config(tmp_path).validate()
+def test_bad_settings_are_named(field, value):
+    SIZES.validate()
     with pytest.raises(ValueError, match=rf"^{field} is .*must"):
-        config(tmp_path, **{field: value}).validate()
+        dataclasses.replace(SIZES, **{field: value}).validate()
+
+
+def test_results_are_told_after_each_crash():
+    told, small = [], dataclasses.replace(SIZES, most=2, checks=8, tries=4)
+    keep = lambda found: told.append(len(found["looked_at"]))  # noqa: E731
+    found = crashes.look_at_crashes(jax.random.key(0), eager(1.0), small, on_result=keep)
+    assert told == [1, 2]
+    assert (found["x"], found["episodes"]) == (1.0, 50)
+    assert [crash["hit"] for crash in found["looked_at"]] == 2 * [["pit"]]
+    low, high = found["crash_ci95"]
+    assert low < found["crashes"] / 50 <= high
 
 
 @pytest.mark.slow
 def test_a_run_s_crashes_are_told_and_drawn(finished, tmp_path, capsys):
-    from experiments import runs
-    from rp_jax import storage
-
-    loaded = runs.load(finished)
-    folder = storage.new_folder(tmp_path / "out")
-    told = crashes.run(config(tmp_path, run=finished, steps=2, most=2, checks=8), loaded, folder)
-    assert json.loads((folder / "crashes.json").read_text()) == told
+    out = tmp_path / "out"
+    sizes = ["--episodes", "50", "--most", "2", "--steps", "2", "--tries", "32", "--checks", "8"]
+    crashes_command.main(["--run", str(finished), "--out", str(out), *sizes])
+    told = json.loads((out / "crashes.json").read_text())
     assert told["episodes"] == 50
+    assert (told["env"], told["variant"]) == ("circuit", "circle")
     assert len(told["looked_at"]) == min(2, told["crashes"])
     assert f"{told['crashes']} crashes of 50" in capsys.readouterr().out
-    assert (folder / "crashes.png").exists() == (told["crashes"] > 0)
+    assert (out / "crashes.png").exists() == (told["crashes"] > 0)

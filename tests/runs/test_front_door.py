@@ -187,7 +187,7 @@ def test_a_world_that_cannot_be_found_must_be_given(agents, tmp_path):
     rp_jax.save(tmp_path, lonely)
     with pytest.raises(StorageError, match="cannot be imported"):
         rp_jax.load(tmp_path)
-    with pytest.raises(StorageError, match="the parameters were not made by make_params alone"):
+    with pytest.raises(StorageError, match="the parameters cannot be made anew"):
         rp_jax.load(tmp_path, env)
     same(rp_jax.load(tmp_path, env, agents.pmdp.params).weights, agents.weights)
 

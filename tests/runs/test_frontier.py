@@ -1,58 +1,76 @@
-"""Return and crash rate over x: planners side by side, and one that is told x."""
+"""Return and crash rate over x, on the corridor: agents side by side, and agents told x."""
 
-import dataclasses
 import json
 
+import jax
 import numpy as np
+import probe
 import pytest
-from tiny import TINY, TINY_THREAT, programs_of_a_moment  # noqa: F401
 
-from experiments import cli, frontier, jam, training
+from rp_jax.planning.loop import LoopConfig
+from rp_jax.runs.frontier import SEPARATE, TOLD, check_thresholds, frontier, over_seeds
+from rp_jax.threat.function import ThreatFunction
+
+PLANNING = LoopConfig(steps=400, num_envs=8, batch=16, n_step=2, replay=128, replay_start=16)
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory):
-    out = tmp_path_factory.mktemp("results") / "frontier"
-    words = f"{TINY} {TINY_THREAT.format('obstacle')} --obstacles 3 --test-obstacles 3"
-    argv = [*words.split(), "--thresholds", "0.2", "0.9", "--out", str(out)]
-    cli.main("frontier", "", frontier.PRESETS, jam.make_task, argv, run=frontier.run)
-    return out
+def made(tmp_path_factory):
+    """All rows, and the folder that they were made in."""
+    params, folder = probe.make_params(), tmp_path_factory.mktemp("frontier")
+    threat = ThreatFunction({"pit": probe.threat_model(params)}, probe.sub_rmdps(params))
+    with jax.numpy_rank_promotion("allow"):
+        rows = frontier(
+            jax.random.key(0),
+            probe,
+            params,
+            threat,
+            thresholds=(0.2, 0.9),
+            tests={"slip .1": params, "slip .5": probe.make_params(slip=0.5)},
+            seeds=2,
+            config=PLANNING,
+            episodes=16,
+            folder=folder,
+        )
+    return rows, folder
 
 
-def test_each_planner_and_threshold_has_a_row_over_all_seeds(results):
-    rows = json.loads((results / "frontier.json").read_text())
-    assert [(row["planner"], row["x"]) for row in rows] == [
-        (planner, x) for planner in ("separate", "told x") for x in (0.2, 0.9)
+def test_each_kind_of_agent_test_and_threshold_has_a_row_over_all_seeds(made):
+    rows, _ = made
+    assert [(row["planner"], row["variant"], row["x"]) for row in rows] == [
+        *((SEPARATE, test, x) for test in ("slip .1", "slip .5") for x in (0.2, 0.9)),
+        *((TOLD, test, x) for test in ("slip .1", "slip .5") for x in (0.2, 0.9)),
     ]
     for row in rows:
-        assert (row["variant"], row["seeds"], row["episodes"]) == ("N=3", 2, 32)
+        assert (row["seeds"], row["episodes"]) == (2, 32)
         assert row["crash_ci95"][0] <= row["crash_rate"] <= row["crash_ci95"][1]
         assert np.isfinite(row["return_mean"])
-    assert (results / "frontier.png").stat().st_size > 10_000
+        assert 0 <= row["insecure"] <= 1
 
 
-def test_all_members_learn_and_none_acts_inadmissibly(results):
+def test_all_agents_learn_and_none_acts_inadmissibly(made):
+    _, folder = made
     for name, count in (("separate", 4), ("told", 2)):
-        lines = (results / name / "metrics.jsonl").read_text().splitlines()
+        lines = (folder / name / "metrics.jsonl").read_text().splitlines()
         history = [json.loads(line) for line in lines]
         assert len(history) % count == 0
         assert sum(row["inadmissible"] for row in history) == 0
-    methods = {json.loads(line)["method"] for line in lines}
-    assert methods == {"RP, plans (x=1)"}
+        first = history[:count]
+        seeds, methods = [row["seed"] for row in first], [row["method"] for row in first]
+        assert seeds == [0, 1] * (count // 2)
+        of = {"separate": ["RP (x=0.2)"] * 2 + ["RP (x=0.9)"] * 2, "told": ["RP (x=0.9)"] * 2}
+        assert methods == of[name]
 
 
-def test_members_differ_in_threshold_and_seed_alone():
-    config = dataclasses.replace(frontier.quick("tuned"), seeds=2, thresholds=(0.1, 0.2))
-    assert frontier.members_of(config) == [
-        training.Member(0, 0.1, 0.0),
-        training.Member(1, 0.1, 0.0),
-        training.Member(0, 0.2, 0.0),
-        training.Member(1, 0.2, 0.0),
-    ]
+def test_rows_are_pooled_over_seeds_alone():
+    row = {"planner": "a", "variant": "b", "x": 0.1, "insecure": 0.2, "return_mean": 1.0}
+    row |= {"return_ci95": 0.5, "episodes": 10, "crashes": 1}
+    found = over_seeds([row, {**row, "x": 0.2}, {**row, "insecure": 0.4, "return_mean": 3.0}])
+    assert [(of["x"], of["seeds"], of["return_mean"]) for of in found] == [(0.1, 2, 2), (0.2, 1, 1)]
+    assert found[0]["insecure"] == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize("thresholds", [(), (0.1,), (0.2, 0.1), (0.1, 0.1), (0.0, 0.1), (0.1, 2.0)])
 def test_thresholds_out_of_order_or_range_are_refused(thresholds):
-    config = dataclasses.replace(frontier.quick("tuned"), thresholds=thresholds)
     with pytest.raises(ValueError, match=r"^thresholds is "):
-        config.validate()
+        check_thresholds(thresholds)

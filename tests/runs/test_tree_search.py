@@ -48,7 +48,7 @@ def test_only_the_episodes_asked_for_are_given(monkeypatch):
     )
     assert rows.score.shape == (3,)
     assert np.isfinite(seconds)
-    assert [of[:3] for of in said] == [("MPC", done, 3) for done in (0, 2, 3)]
+    assert [of[:3] for of in said] == [("search", done, 3) for done in (0, 2, 3)]
 
 
 def test_names_tell_steps_and_limit():

@@ -6,7 +6,8 @@ from pathlib import Path
 import jax
 import pytest
 
-from experiments import recipes, truth
+from experiments import truth
+from rp_jax import recipes
 from rp_jax.envs import circuit, jam
 from rp_jax.threat import build
 

@@ -17,7 +17,7 @@ def wrong_dangers(trial: Trial) -> list[str]:
         trial: the environment.
     """
     steps = join(trial.steps, trial.placed)
-    danger = np.asarray(steps.outcome.danger) > 0
+    danger = ~(np.asarray(steps.outcome.danger) <= 0)  # nan is told elsewhere
     hit = {kind: contact.hit | contact.hit_before for kind, contact in steps.contacts.items()}
     found = []
     for kind, hits in hit.items():

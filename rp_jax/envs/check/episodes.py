@@ -3,9 +3,9 @@
 import jax
 import numpy as np
 
-from rp_jax.envs.check.batches import take
+from rp_jax.envs.check.batches import join, take
 from rp_jax.envs.check.problems import number_of, value_of
-from rp_jax.envs.check.trial import Trial
+from rp_jax.envs.check.trial import Steps, Trial
 
 
 def odd_values(trial: Trial) -> list[str]:
@@ -46,7 +46,7 @@ def wrong_ends(trial: Trial) -> list[str]:
     Args:
         trial: the environment.
     """
-    steps, limit = trial.steps, trial.limit
+    steps, limit = join(trial.steps, trial.placed), trial.limit
     outcome, time = steps.outcome, steps.reached.time
     count, before = len(time), steps.before.time
     allowed = f"the time limit is {limit}"
@@ -93,12 +93,12 @@ def wrong_ends(trial: Trial) -> list[str]:
         if bad.any():
             where = number_of(int(bad.sum()), count, "steps")
             found.append(f"{text(int(np.argmax(bad)))} (in {where}); {rule}")
-    return found + _wrong_starts(trial)
+    return found + _wrong_starts(steps)
 
 
-def _wrong_starts(trial: Trial) -> list[str]:
+def _wrong_starts(steps: Steps) -> list[str]:
     """What is wrong with the states that `auto_reset_step` carries on."""
-    steps, found = trial.steps, []
+    found = []
     ended = np.asarray(steps.outcome.done)
     time = steps.carried.time[ended]
     if (time != 0).any():

@@ -50,7 +50,7 @@ def _moved_by_source(trial: Trial, pairs: Pairs) -> list[str]:
 
 def _moved_by_step(trial: Trial, pairs: Pairs, kind: str) -> list[str]:
     """Static hazards that are in reach after a step, and not hit, must be where they were."""
-    rows = trial.draws.among(np.arange(len(trial.steps.action)), 128)
+    rows = trial.draws.among(np.arange(len(trial.steps.action)), 256)
     before, reached = (take(tree, rows) for tree in (trial.steps.before, trial.steps.reached))
     was, now = (trial.find(trial.params, states)[kind] for states in (before, reached))
     where, which = np.nonzero(was.present)

@@ -7,7 +7,7 @@ import numpy as np
 
 from rp_jax.dynamics import num_threats
 from rp_jax.envs.check.body_structure import draw_problems
-from rp_jax.envs.check.problems import described, differences
+from rp_jax.envs.check.problems import described, differences, plain
 from rp_jax.envs.check.shapes import common_length, first_row, missing_methods, scalar, shape_of
 from rp_jax.validate import shown
 
@@ -61,7 +61,7 @@ def _sub_problems(kind: str, sub: Any, model: Any) -> list[str]:
         return found
     beta = np.asarray(sub.beta)
     if beta.shape != () or not 0 < beta <= 1:
-        found.append(f"beta of {kind!r} is {shown(sub.beta)}; it must be above 0 and at most 1")
+        found.append(f"beta of {kind!r} is {plain(sub.beta)}; it must be above 0 and at most 1")
     if sub.body is not model and num_threats(sub.body) != num_threats(model):
         found.append(
             f"the body of sub_rmdps(params)[{kind!r}] has {num_threats(sub.body)} threats and "

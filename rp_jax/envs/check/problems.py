@@ -62,6 +62,13 @@ def value_of(array: Any) -> str:
     return text if len(values) == 1 else f"[{text}]"
 
 
+def plain(value: Any) -> str:
+    """Returns what a sentence says of a setting: a number with its type, or as it is shown."""
+    if isinstance(value, jax.Array | np.ndarray | np.generic) and value.ndim == 0:
+        return f"{value:.6g} ({value.dtype})"
+    return shown(value)
+
+
 def described(leaf: Any) -> str:
     """Returns the type and the shape of a leaf, such as "float32[3, 2]"."""
     if hasattr(leaf, "shape") and hasattr(leaf, "dtype"):

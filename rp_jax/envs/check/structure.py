@@ -11,7 +11,7 @@ from rp_jax.dynamics import Plans
 from rp_jax.envs import optional
 from rp_jax.envs.check.body_structure import action_problems, body_problems, mirror_problems
 from rp_jax.envs.check.hazard_structure import hazard_problems
-from rp_jax.envs.check.problems import described, differences, trouble
+from rp_jax.envs.check.problems import described, differences, plain, trouble
 from rp_jax.envs.check.shapes import scalar, shape_of
 from rp_jax.validate import shown
 
@@ -97,7 +97,7 @@ def _limit_problems(params: Any) -> list[str]:
     limit = np.asarray(params.time_limit)
     if limit.shape == () and np.issubdtype(limit.dtype, np.integer) and limit >= 1:
         return []
-    return [f"params.time_limit is {shown(params.time_limit)}; it must be a () integer, at least 1"]
+    return [f"params.time_limit is {plain(params.time_limit)}; it must be a () integer, at least 1"]
 
 
 def _action_problems(env: Any, params: Any) -> list[str]:

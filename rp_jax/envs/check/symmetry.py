@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import numpy as np
 
 from rp_jax.envs.check.batches import repeat, take
@@ -33,17 +34,20 @@ def asymmetries(trial: Trial) -> list[str]:
 def _of_kind(trial: Trial, pairs: Pairs) -> list[str]:
     name = f"the source of {pairs.kind!r}"
     pair = pairs.sample(PAIRS)
+    pair = take(pair, np.isfinite(pairs.features(*pair)).all(axis=1))  # others are told elsewhere
     features = pairs.features(*pair)
+    if not len(features):
+        return []
     image = pairs.mirror(features)
     tolerance = tolerance_of(features, *pair)
     bad = beyond(pairs.mirror(image), features, tolerance)
     if bad.any():
         row = int(np.argmax(bad))
-        twice = value_of(pairs.mirror(image)[row])
+        twice, where = pairs.mirror(image)[row], number_of(int(bad.sum()), len(bad), "pairs")
         return [
-            f"mirrored of {name} takes the features {value_of(features[row])} to {twice} when it "
-            f"is applied twice (in {number_of(int(bad.sum()), PAIRS, 'pairs')}); the mirror image "
-            "of a mirror image must be the original"
+            f"mirrored of {name} takes the features {value_of(features[row])} to {value_of(twice)} "
+            f"when it is applied twice (in {where}); the mirror image of a mirror image must be "
+            "the original"
         ]
     other = pairs.restore(image)
     found = _hits_differ(name, pairs, pair, other)
@@ -67,11 +71,12 @@ def _actions_differ(
 ) -> list[str]:
     """The body moves, the hazard is held."""
     images = np.asarray(trial.model.mirrored_threats())
-    index, count = trial.draws.integers(PAIRS, len(images)), trial.num_actions
+    rows, count = len(jax.tree.leaves(pair)[0]), trial.num_actions
+    index = trial.draws.integers(rows, len(images))
     (plans, actions), (their_plans, theirs) = (
         (i // count, (i % count).astype(np.int32)) for i in (index, images[index])
     )
-    bad, (body, twin) = np.zeros(PAIRS, bool), (pair[0], other[0])
+    bad, (body, twin) = np.zeros(rows, bool), (pair[0], other[0])
     for k in range(STEPS):
         follow = k - 1 if trial.plans else -1  # the plan, after the first action
         choice, their_choice = ((i + 0.5) / (len(images) // count) for i in (plans, their_plans))
@@ -84,7 +89,7 @@ def _actions_differ(
     worst = int(np.argmax(np.bincount(index[bad], minlength=len(images))))
     return [
         f"mirrored of {name} and params.body.mirrored_threats do not fit together in "
-        f"{number_of(int(bad.sum()), PAIRS, 'pairs')}, most with index {worst}, whose mirror "
+        f"{number_of(int(bad.sum()), len(bad), 'pairs')}, most with index {worst}, whose mirror "
         f"image is said to be {images[worst]}: from mirrored situations, mirrored actions must "
         "lead to mirrored features"
     ]
@@ -94,7 +99,7 @@ def _chances_differ(
     trial: Trial, name: str, pairs: Pairs, pair: Any, other: Any, tolerance: np.ndarray
 ) -> list[str]:
     """The hazard moves, and the body under the baseline policy: alike in distribution."""
-    rows = trial.draws.among(np.arange(PAIRS), CASES)
+    rows = trial.draws.among(np.arange(len(jax.tree.leaves(pair)[0])), CASES)
     actions = np.zeros(CASES * KEYS, np.int32)
     samples = []
     for bodies, hazards in (pair, other):

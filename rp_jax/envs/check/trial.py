@@ -177,7 +177,8 @@ class Trial:
     def placed(self) -> Steps:
         """Steps from visited states in which the body is where it was in another visited state.
 
-        Most of them are chosen so that the body would hit a hazard that stands still.
+        Most of them are chosen so that the body would hit a hazard that stands still; a third are
+        the last before the time limit.
         """
         steps, draws = self.steps, self.draws
         count, places = len(steps.action), self.at_most(PLACES)
@@ -189,7 +190,9 @@ class Trial:
             if hits.any():
                 chosen.append(draws.among(np.flatnonzero(hits), 4 * BATCH))
         rows = np.concatenate(chosen)
-        return self.advance(take(states, rows), take(steps.action, whose[rows]))
+        states, last = take(states, rows), np.arange(len(rows)) % 3 == 0
+        time = np.where(last, self.limit - 1, states.time).astype(states.time.dtype)
+        return self.advance(replaced(states, time=time), take(steps.action, whose[rows]))
 
     @functools.cached_property
     def _meets(self) -> Batched:
