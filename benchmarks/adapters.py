@@ -16,7 +16,7 @@ STEPS, REPEATS = 10, 40
 
 
 def raw(name: str, batch: int) -> Callable[[np.ndarray], None]:
-    """A step with observations and fresh starts, and nothing else."""
+    """Returns a step with observations and fresh starts, and nothing else."""
     env, params = registry.make(name)
     look = lambda states: jax.vmap(env.observe, (0, None))(states, params)  # noqa: E731
 
@@ -37,7 +37,7 @@ def raw(name: str, batch: int) -> Callable[[np.ndarray], None]:
 
 
 def adapted(name: str, batch: int) -> Callable[[np.ndarray], None]:
-    """The same through gymnasium."""
+    """Returns the step through gymnasium."""
     from rp_jax.adapters.gymnasium import JaxVectorEnv
 
     env = JaxVectorEnv(name, batch)

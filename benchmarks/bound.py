@@ -25,14 +25,14 @@ class Piece(NamedTuple):
 
 
 class Work(NamedTuple):
-    """What a call of a program gets done."""
+    """The work of a call of a program."""
 
     operations: float  # arithmetic ones, of floats and integers alike
     bytes: float  # read and written
 
 
 class Limits(NamedTuple):
-    """What this machine can do at best."""
+    """The limits of this machine."""
 
     operations: float  # per second, in a float32 matrix product
     bytes: float  # per second, read and written, in a copy in place

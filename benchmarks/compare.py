@@ -11,7 +11,7 @@ Key = tuple[str, str, int]  # name, unit, batch
 
 
 def key_of(row: Row) -> Key:
-    """What a row has in common with the same one of another run."""
+    """Returns what a row has in common with the same one of another run."""
     return row.name, row.unit, row.batch
 
 

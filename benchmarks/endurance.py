@@ -1,4 +1,4 @@
-"""Long runs: does memory grow, is anything compiled again, is an inadmissible action ever taken?
+"""Long runs: whether memory grows, programs are compiled again, or the shield ever fails.
 
 python -m benchmarks.endurance --minutes 120
 python -m benchmarks.endurance --steps 100000000

@@ -41,7 +41,7 @@ class Series:
 def series(
     title: str, size: str, vertical: str, sizes: Sequence[int], rows: Sequence[Row], units: float
 ) -> Series:
-    """Of one row per size, ascending.
+    """Returns the series of one row per size, ascending.
 
     The slope is a least-squares fit over the larger half of the sizes: small ones pay for dispatch.
 

@@ -116,7 +116,7 @@ def in_processes(run: Callable[[], list[Row]], processes: int) -> list[Row]:
 
 
 def recount(row: Row, unit: str, factor: float) -> Row:
-    """The same measurement in another unit, `factor` of which make one of the row's."""
+    """Returns a measurement in another unit, `factor` of which make one of the row's."""
     work = row.bound and dataclasses.replace(
         row.bound, operations=row.bound.operations / factor, bytes=row.bound.bytes / factor
     )

@@ -1,4 +1,4 @@
-"""What a benchmark says: a table, a JSON file, and ratios to an earlier run."""
+"""Reports on benchmarks: a table, a JSON file, and ratios to an earlier run."""
 
 import argparse
 import os
@@ -22,7 +22,7 @@ OUT = Path("results/benchmarks")
 
 
 def machine() -> dict[str, Any]:
-    """What was measured on, and with what."""
+    """Returns facts on the machine and the versions of what was measured."""
     return {
         "device": jax.devices()[0].device_kind,
         "platform": jax.default_backend(),

@@ -57,7 +57,7 @@ def inside(pmdp: PMDP, states: Any) -> dict[str, int]:
 
 
 def more_chunks(pmdp: PMDP, states: Any, turns: float = 1.0) -> list[Piece]:
-    """What a query of the threat works beyond the first turn of its loops over chunks of pairs.
+    """Returns the work of a threat query beyond the first turn of its loops over chunks of pairs.
 
     Args:
         pmdp: with models.

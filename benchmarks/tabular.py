@@ -16,9 +16,9 @@ STATES, ACTIONS, HORIZON, C = 8, 4, 20, 0.5
 
 
 def solved(cmdp: FiniteCMDP) -> jax.Array:
-    """() Algorithm 1 from nothing: eta*, its threat, the evaluated x, and the best return inside.
+    """Solves a CMDP by Algorithm 1: eta*, its threat, the evaluated x, and the best return inside.
 
-    And the worst danger that any policy inside can do, as the proof.
+    Returns the return, and the worst danger that any policy inside can do, as the proof, (2,).
     """
     star = threat.least_threat(cmdp)
     chosen, planned = thresholds.planned(cmdp, C, star.policy, thresholds.by_evaluation)

@@ -37,7 +37,7 @@ from rp_jax.validate import number, one_of
 
 @dataclass(frozen=True)
 class Config:
-    """What is tried."""
+    """Settings of the trial."""
 
     env: str = "circuit"  # or jam
     baseline: str = "paper"  # or plans

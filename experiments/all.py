@@ -67,7 +67,7 @@ NAME = "python -m experiments.all"
 
 @dataclass(frozen=True)
 class Config:
-    """What is made."""
+    """Settings of the command: which results are made, and where."""
 
     preset: str | None = None  # quick (the default) or full
     only: tuple[str, ...] = ()  # results, or runs that they are taken from; default: all results
@@ -76,7 +76,7 @@ class Config:
 
 
 def begun(config: Config) -> tuple[str, Path]:
-    """(preset, folder), of a new folder or of one to go on in.
+    """Returns the preset and the folder: a new one, or one to go on in.
 
     Raises:
         ValueError: a setting is out of range, or the folder cannot be used.
@@ -130,7 +130,7 @@ def result(module: Any, sources: Sources, folder: Path) -> None:
 
 
 def told(module: Any, folder: Path) -> Section:
-    """What a saved result has to say.
+    """Returns the section of the report on a saved result.
 
     Raises:
         FileNotFoundError: a figure of it was not drawn.
@@ -143,7 +143,7 @@ def told(module: Any, folder: Path) -> Section:
 
 
 def all_told(folder: Path, failed: dict[str, str]) -> dict[str, Section]:
-    """Of each saved result; what cannot be told joins those that failed."""
+    """Returns the sections on all saved results; what cannot be told joins those that failed."""
     found = {}
     for name, module in RESULTS.items():
         if name not in failed and (folder / name / "results.json").exists():
@@ -155,7 +155,7 @@ def all_told(folder: Path, failed: dict[str, str]) -> dict[str, Section]:
 
 
 def blocks(folder: Path, preset: str, failed: dict[str, str]) -> list[report.Block]:
-    """The report on all results that are saved in the folder."""
+    """Returns the report on all results that are saved in the folder."""
     told = all_told(folder, failed)
     claims = [claim for section in told.values() for claim in section.claims]
     counts = Counter(claim.verdict.partition(" (")[0] for claim in claims)
@@ -193,7 +193,7 @@ def blocks(folder: Path, preset: str, failed: dict[str, str]) -> list[report.Blo
 
 
 def ledger(folder: Path) -> list[dict[str, Any]]:
-    """A line per run: command, commit, and what it took in all its processes."""
+    """Returns a line per run: command, commit, and what it took in all its processes."""
     lines = []
     for name in COMMANDS:
         if (folder / name / LOG).exists():
@@ -211,7 +211,7 @@ def ledger(folder: Path) -> list[dict[str, Any]]:
 
 
 def main(argv: Sequence[str] | None = None) -> Path:
-    """Exits with 1 if a result failed, with 2 on bad input, with 130 on Ctrl-C."""
+    """Runs the command; exits with 1 if a result failed, 2 on bad input, 130 on Ctrl-C."""
     config = tyro.cli(Config, prog=NAME, description=__doc__, args=argv)
     with errors.bad_input():
         preset, folder = begun(config)

@@ -45,7 +45,7 @@ Rows = list[dict[str, Any]]
 
 @dataclass(frozen=True)
 class Config:
-    """What is compared."""
+    """Settings of a comparison."""
 
     env: str  # circuit, jam or point_gather
     methods: tuple[str, ...] = METHODS  # any of RP, DQN, CPO, PID, MPC
@@ -218,7 +218,7 @@ def with_learning(rows: Sequence[Mapping[str, Any]], learned: Agents | Policies)
 
 
 def by_search(config: Config, run: Run, folder: Path, bar: OnProgress) -> Rows:
-    """Evaluates MPC."""
+    """Evaluates MPC, which learns nothing."""
     world, penalty = run.world, run.config.penalty
     _, _, horizon = SETTINGS[config.env]
     avoided = AVOIDED.get(config.env, penalty)

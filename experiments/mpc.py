@@ -25,7 +25,7 @@ from rp_jax.validate import number, one_of
 
 @dataclass(frozen=True)
 class Config:
-    """What is searched, and how often."""
+    """Settings of a search."""
 
     env: str  # circuit, jam or point_gather
     horizon: int  # steps ahead; the paper: 3, 4, 5 on Circuit, 2, 3 on Jam
@@ -40,14 +40,14 @@ class Config:
 
 
 class Ready(NamedTuple):
-    """What is searched."""
+    """Searches that are about to be made."""
 
     searches: dict[str, Search]  # by variant
     penalty: float  # in tables, per unit of danger
 
     @property
     def penalties(self) -> dict[str, float]:
-        """What danger costs in the tables, and in the search."""
+        """The cost of danger, in the tables and in the search."""
         in_search = float(next(iter(self.searches.values())).penalty)
         return {"table": self.penalty, "search": in_search}
 

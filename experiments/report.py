@@ -16,14 +16,14 @@ MEDIA = {".png": "image/png", ".gif": "image/gif"}
 
 
 class Heading(NamedTuple):
-    """Of a section (level 2) or the report (level 1)."""
+    """A heading of a section (level 2) or of the report (level 1)."""
 
     text: str
     level: int = 2
 
 
 class Grid(NamedTuple):
-    """A table."""
+    """A table with a title."""
 
     title: str
     rows: Sequence[Mapping[str, Any]]
@@ -54,13 +54,13 @@ td.not { background: #fed7d7; }
 
 
 def write(folder: Path, blocks: Sequence[Block]) -> None:
-    """REPORT.md and report.html in a folder that holds the pictures."""
+    """Writes REPORT.md and report.html into a folder that holds the pictures."""
     storage.write_bytes(folder / "REPORT.md", "\n".join(markdown(blocks)).encode())
     storage.write_bytes(folder / "report.html", "".join(page(blocks, folder)).encode())
 
 
 def section(name: str, title: str, told: Section) -> list[Block]:
-    """The blocks of a result whose pictures lie in the folder `name`."""
+    """Returns the blocks of a result whose pictures lie in the folder `name`."""
     blocks: list[Block] = [Heading(title), told.text]
     blocks += [Figure(f"{name}/{file}", caption) for file, caption in told.figures.items()]
     blocks += [Grid(table.title, table.rows) for table in told.tables]
@@ -70,12 +70,12 @@ def section(name: str, title: str, told: Section) -> list[Block]:
 
 
 def verdicts(claims: Iterable[Claim], title: str = "Verdicts") -> Grid:
-    """A line per published claim."""
+    """Returns a table with a line per published claim."""
     return Grid(title, [claim._asdict() for claim in claims])
 
 
 def markdown(blocks: Iterable[Block]) -> Iterable[str]:
-    """The lines of REPORT.md."""
+    """Yields the lines of REPORT.md."""
     for block in blocks:
         match block:
             case Heading(text, level):
@@ -96,7 +96,7 @@ def markdown(blocks: Iterable[Block]) -> Iterable[str]:
 
 
 def page(blocks: Iterable[Block], folder: Path) -> Iterable[str]:
-    """The parts of report.html."""
+    """Yields the parts of report.html."""
     yield '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>rp_jax</title>'
     yield f"<style>{STYLE}</style></head><body>\n"
     for block in blocks:
@@ -130,5 +130,5 @@ def _grid(title: str, rows: Sequence[Mapping[str, Any]]) -> Iterable[str]:
 
 
 def data_uri(path: Path) -> str:
-    """A picture as text."""
+    """Returns a picture as text."""
     return f"data:{MEDIA[path.suffix]};base64,{base64.b64encode(path.read_bytes()).decode()}"

@@ -26,7 +26,7 @@ RECORDED = {"wall": "wall", "obstacle": "car"}  # kinds of hazard as the files c
 
 @dataclass(frozen=True)
 class Config:
-    """What is compared."""
+    """Settings of the comparison."""
 
     env: str  # circuit or jam
     threat: Path  # folder of the threat function

@@ -31,7 +31,7 @@ class State(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What a step led to."""
+    """The result of a step."""
 
     state: State
     reward: float
@@ -109,7 +109,7 @@ def step(rng: np.random.Generator, state: State, action: int) -> Step:
 
 
 def observe(state: State) -> np.ndarray:
-    """(396,) LIDAR of the walls (360), the 8 nearest obstacles (32), x, y, heading, speed."""
+    """Returns the observation (396,): LIDAR of the walls (360), 8 obstacles (32), and the pose."""
     body = state.body
     offset = POINTS - body[:2]
     distance = np.hypot(*offset.T)

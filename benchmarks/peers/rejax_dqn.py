@@ -17,7 +17,7 @@ ITERATIONS = 100
 
 
 class Jam:
-    """What rejax asks of an environment: gymnax's functions, with one `done`.
+    """Jam with the functions that rejax asks for: gymnax's, with one `done`.
 
     The observation is what our network sees: the pooled LIDAR and the rest, of the order of 1.
     """
@@ -28,11 +28,11 @@ class Jam:
         self.default_params = jam.make_params()
 
     def action_space(self, params: jam.Params) -> Any:
-        """15 actions."""
+        """The space of 15 actions."""
         return self._discrete(jam.num_actions(params))
 
     def observation_space(self, params: jam.Params) -> Any:
-        """(81,) floats."""
+        """The space of observations, (81,) floats."""
         size = jam.LIDAR_BINS // networks.POOLS["tuned"] + len(jam.SCALE)
         return self._box(-100.0, 100.0, (size,), jnp.float32)
 
@@ -56,7 +56,7 @@ class Jam:
 
 
 def run() -> list[Row]:
-    """The same widths, environments, batch, updates and replay as our tuned recipe."""
+    """Measures the widths, environments, batch, updates and replay of our tuned recipe."""
     from flax import linen as nn
     from gymnax.environments import spaces
     from rejax import DQN

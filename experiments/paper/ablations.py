@@ -35,7 +35,7 @@ def plot(results: list[dict[str, Any]], folder: Path) -> None:
 
 
 def tell(results: list[dict[str, Any]]) -> Section:
-    """What each switch costs or gains."""
+    """Returns the section on what each switch costs or gains."""
     return Section(
         "Table 1's RP: horizon 8, target over admissible actions (Algorithm 4), the paper's "
         "baseline policy, exact labels for walls, preferential sampling for obstacles, many "

@@ -1,4 +1,4 @@
-"""What is learned and played: one command line per run, in two sizes.
+"""Command lines of all runs that results are taken from, in two sizes.
 
 A word that begins with @ is a file of another run, which is made first.
 """

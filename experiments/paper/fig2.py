@@ -23,7 +23,7 @@ def plot(results: dict[str, Any], folder: Path) -> None:
 
 
 def tell(results: dict[str, Any]) -> Section:
-    """What the text of section 5.2 says about the figure."""
+    """Returns the section: what the text of section 5.2 says about the figure."""
     threat = results["threat"]  # (actions, rows, columns)
     down_the_edge = [threat[RIGHT][row][-1] for row in range(len(results["rows"]))]
     others = {

@@ -74,7 +74,7 @@ def tell(results: dict[str, Any]) -> Section:
 
 
 def rise(env: str, of: dict[str, Any]) -> list[dict[str, Any]]:
-    """Of a table: a method's return while exploring, in the last tenth of its steps and before."""
+    """Returns lines of a table: returns while exploring, in the last tenth of steps and before."""
     lines = []
     for method in dict.fromkeys(row["method"] for row in of["history"]):
         rows = [row for row in of["history"] if row["method"] == method and row["episodes"]]

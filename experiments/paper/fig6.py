@@ -80,7 +80,7 @@ def plot(results: list[dict[str, Any]], folder: Path) -> None:
 
 
 def tell(results: list[dict[str, Any]]) -> Section:
-    """Who crashes."""
+    """Returns the section on who crashes."""
     crashed = {
         (row["method"], row["track"]): sum(any(e["hit"]) for e in row["episodes"])
         for row in results

@@ -41,7 +41,7 @@ def read_lines(path: Path) -> list[Row]:
 
 
 def named(rows: Sequence[Row], method: str) -> list[Row]:
-    """The same rows, all of one method."""
+    """Returns the same rows, all of one method."""
     return [{**row, "method": method} for row in rows]
 
 
@@ -90,7 +90,7 @@ def curves(sources: Any, env: str) -> list[Row]:
 
 
 def repenalised(row: Row, more: float) -> Row:
-    """The same episodes with `more` taken off per crash; an episode has one crash at most.
+    """Returns a row of the same episodes, at most one crash each, with `more` taken off per crash.
 
     The variance follows from that of the returns and the mean return of those without a crash.
     """
@@ -270,7 +270,7 @@ def less_earned(one: Row, other: Row) -> bool:
 
 
 def goals(scores: Sequence[Row], env: str) -> Table:
-    """What this project set itself: the paper's return, and a bound on the crash rate."""
+    """Returns a table of goals: the paper's return, and a bound on the crash rate."""
     lines = []
     for row in scores:
         variant = row["variant"]

@@ -1,4 +1,4 @@
-"""What a result says in the report, and how a verdict comes about."""
+"""Sections of the report on a result, and how its verdicts come about."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

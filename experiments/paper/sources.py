@@ -140,7 +140,7 @@ def timed(command: list[str], lock: int) -> dict[str, Any]:
 
 
 def commit() -> str:
-    """Of the code that runs, with a + if files differ from it; "" where there is no git."""
+    """Returns the commit of the code that runs, with a + if files differ; "" without git."""
     try:
         here = Path(__file__).parent
         git = lambda *words: subprocess.run(  # noqa: E731

@@ -34,11 +34,11 @@ class Walls(struct.PyTreeNode):
 
     @property
     def horizon(self) -> int:
-        """Of a wall point."""
+        """The horizon of a wall point."""
         return self.wall.horizon
 
     def hits(self, body: Any, points: Hazards) -> Array:
-        """Any of them is."""
+        """Returns whether any of the wall points is hit."""
         return jnp.any(jax.vmap(self.wall.hits, (None, 0))(body, points.state) & points.present)
 
 
@@ -68,7 +68,7 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
 
 
 def exact(key: Array, bodies: Any, points: Hazards, sub: SubRMDP) -> tuple[np.ndarray, np.ndarray]:
-    """(joint, summed) threats (B, A) of the wall points near agents (B, ...)."""
+    """Returns (joint, summed) threats (B, A) of the wall points near bodies (B,)."""
     walls: Any = Walls(wall=sub.source)
     both = sub.replace(source=walls)
     count = points.present.shape[0]
@@ -78,7 +78,7 @@ def exact(key: Array, bodies: Any, points: Hazards, sub: SubRMDP) -> tuple[np.nd
 
 
 def compared(threat: np.ndarray, joint: np.ndarray, x: float) -> dict[str, Any]:
-    """What threats (B, A) admit at x, and by how much they exceed the joint ones."""
+    """Returns what threats (B, A) admit at x, and by how much they exceed the joint ones."""
     ratios = []
     for low, high in itertools.pairwise(BINS):
         inside = (joint > low) & (joint <= high)
@@ -92,7 +92,7 @@ def compared(threat: np.ndarray, joint: np.ndarray, x: float) -> dict[str, Any]:
 
 
 def tell(results: list[dict[str, Any]]) -> Section:
-    """What the sum costs."""
+    """Returns the section on what the sum costs."""
     names = [f"{low:g} to {high:g}" for low, high in itertools.pairwise(BINS)]
     lines = []
     for row in results:

@@ -192,8 +192,8 @@ class JaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.num_envs = int(positive("num_envs", num_envs, integer=True))
         self.env, self.params = registry.make(name, **settings)
         self.single_observation_space, self.single_action_space = _spaces(self.env, self.params)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.states: Any = None
 
     def reset(

@@ -81,14 +81,15 @@ class BraxBody(struct.PyTreeNode):
     def mirrored_threats(self) -> np.ndarray:
         """Returns the index of each action's left-right mirror image, (A,) int.
 
-        Without `mirror` each action counts as its own image.
-
         Raises:
-            ValueError: the table does not hold the mirror image of every action.
+            ValueError: there is no `mirror`, or the table does not hold the mirror image of every
+                action.
         """
         table = np.asarray(self.actions)
         if self.mirror is None:
-            return np.arange(len(table))
+            raise ValueError(
+                "mirror is None; it must be given where a hazard source has `mirrored`"
+            )
         missing = "actions: the table holds no mirror image of some of its actions"
         return mirror_images(table, self.mirror, missing)
 

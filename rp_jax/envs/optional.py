@@ -51,6 +51,17 @@ def clearance(env: Env, position: Array, params: Any) -> Array:
     return jnp.full((), jnp.inf, position.dtype)
 
 
+def threshold(env: Env, state: Any, x: Array) -> Array:
+    """Returns the largest admissible threat in a state, ().
+
+    Args:
+        env: the environment.
+        state: the state, unbatched.
+        x: () the threshold of environments that do not say.
+    """
+    return env.threshold(state) if hasattr(env, "threshold") else jnp.asarray(x)
+
+
 def lidar_bins(env: Env) -> int:
     """Returns how many of an observation's first values are distances of a LIDAR; 0 by default.
 

@@ -84,9 +84,9 @@ class Conditioned:
 
     @property
     def SCALE(self) -> tuple[float, ...]:  # noqa: N802
-        """The factors of the rest of an observation, for learners; the last is that of log10 x."""
+        """The factors of the rest of an observation, for learners."""
         scale = optional.scale(self.env)
-        return (*scale, 0.5) if scale else ()
+        return (*scale, 1.0) if scale else ()
 
     def reset(self, key: Array, params: Params) -> State:
         """Draws a start and a threshold.
@@ -127,14 +127,14 @@ class Conditioned:
         return state.x
 
     def observe(self, state: State, params: Params) -> Array:
-        """Returns the environment's observation, with log10 x appended.
+        """Returns the environment's observation, with half of log10 x appended.
 
         Args:
             state: the state.
             params: the parameters.
         """
         seen = self.env.observe(state.inner, params.inner)
-        return jnp.concatenate([seen, jnp.log10(state.x)[None].astype(seen.dtype)])
+        return jnp.concatenate([seen, 0.5 * jnp.log10(state.x)[None].astype(seen.dtype)])
 
     def hazards(self, state: State, params: Params) -> dict[str, Hazards]:
         """Returns, by kind, the hazards that `sub_rmdps` has threats for.

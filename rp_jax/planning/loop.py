@@ -1,6 +1,5 @@
 """The training loop: acting, threat, replay and learning in one jitted chunk."""
 
-import functools
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ from rp_jax.planning import dqn
 from rp_jax.planning.dqn import DQNConfig, Learner, Transition
 from rp_jax.planning.networks import NETWORKS
 from rp_jax.planning.nstep import Taken, n_step_transition
-from rp_jax.planning.percept import Encoded, faults
+from rp_jax.planning.percept import Percept, faults
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import finite, none_bad, number, one_of, random_key
 
@@ -98,21 +97,11 @@ class Metrics(NamedTuple):
     bad_rewards: Array  # steps with a reward that is nan or infinite
 
 
-class Seen(NamedTuple):
-    """Observations and threats of the states that the environments are in."""
-
-    encoded: Encoded  # (B,)
-    threat: Array  # (B, A)
-    admissible: Array  # (B, A) bool
-    secure: Array  # (B,) bool, some action is admissible by its threat
-    threshold: Array  # (B,) largest admissible threat
-
-
 class LoopState(NamedTuple):
     """All that training carries from one iteration to the next."""
 
     states: Any  # (B,) environment states
-    seen: Seen  # of those states
+    seen: Percept  # of those states
     running: tally.Running  # (B,) episodes
     window: Taken  # (n_step, B), oldest first
     learner: Learner
@@ -180,12 +169,6 @@ def _choose(key: Array, values: Array, admissible: Array, epsilon: Array) -> Arr
     return action.astype(jnp.int32)
 
 
-def _look(pmdp: PMDP, states: Any) -> Seen:
-    percept = pmdp.perceive(states)
-    encoded, admissible, secure, threat, threshold = percept
-    return Seen(encoded, threat, admissible, secure, threshold)
-
-
 def interact(
     key: Array, state: LoopState, pmdp: PMDP, network: nn.Module, config: LoopConfig
 ) -> tuple[LoopState, Metrics]:
@@ -213,7 +196,7 @@ def interact(
         state.states,
         action,
         pmdp.params,
-        functools.partial(_look, pmdp),
+        pmdp.perceive,
     )
     insecure = ~seen.secure & ~outcome.terminated
     taken = Taken(
@@ -245,7 +228,7 @@ def interact(
     return state, metrics
 
 
-def _inadmissible(seen: Seen, action: Array) -> Array:
+def _inadmissible(seen: Percept, action: Array) -> Array:
     """(B,) bool, checked against the threats themselves and not against the mask."""
     taken = jnp.take_along_axis(seen.threat, action[:, None], axis=-1)[:, 0]
     least = jnp.min(seen.threat, axis=-1)
@@ -271,8 +254,8 @@ def begin(key: Array, pmdp: PMDP, config: LoopConfig) -> LoopState:
     network, replay = make_network(config, pmdp), make_replay(config)
     resets = jax.random.split(reset_key, batch)
     states = jax.vmap(pmdp.env.reset, (0, None))(resets, pmdp.params)
-    seen = _look(pmdp, states)
-    encoded, threat, admissible, *_ = seen
+    seen = pmdp.perceive(states)
+    encoded, admissible, _, threat, _ = seen
     zeros = jnp.zeros(batch, threat.dtype)
     false = jnp.zeros(batch, bool)
     taken = Taken(encoded, jnp.zeros(batch, jnp.int32), zeros, false, false, encoded, admissible)

@@ -67,9 +67,7 @@ class PMDP(struct.PyTreeNode):
         Args:
             states: states, leading axis (B,).
         """
-        if hasattr(self.env, "threshold"):
-            return jax.vmap(self.env.threshold)(states)
-        return jnp.broadcast_to(self.x, states.time.shape)
+        return jax.vmap(optional.threshold, (None, 0, None))(self.env, states, self.x)
 
     def advance(self, keys: Array, states: Any, actions: Array) -> tuple[Any, Outcome]:
         """Makes one transition of each state of a batch.
@@ -161,7 +159,7 @@ class PMDP(struct.PyTreeNode):
 
         reached, outcome = jax.vmap(outcomes)(states)  # (B, A, S)
         flat = lambda a: a.reshape(-1, *a.shape[3:])  # noqa: E731
-        # The body's own step is deterministic, so that one per action is enough.
+        # A body's step takes no random numbers, so that one outcome per action is enough.
         bodies = jax.tree.map(lambda a: a[:, :, 0].reshape(-1, *a.shape[3:]), reached.body)
         static = self._static(bodies)
         if static is not None:

@@ -351,7 +351,7 @@ def comparison(
                 axis.plot([r[horizontal] for r in of], [r[quantity] for r in of], ".", color=colour)
             axis.set_xscale("log")
             axis.set_yscale("log" if all(r[quantity] > 0 for r in here) else "linear")
-            axis.set_xlabel(f"labelled {horizontal}")
+            axis.set_xlabel(horizontal.replace("_", " "))
             axis.grid(alpha=0.3, which="both")
             if i == 0:
                 axis.set_title(", ".join(column), fontsize=10)

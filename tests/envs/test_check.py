@@ -710,6 +710,20 @@ def a_mirror_image_that_is_shifted():
     return with_pedestrian(Pedestrian)
 
 
+@mutant(
+    "mirror images", r"mirrored of the source of 'pedestrian' gives features that no", slow=True
+)
+def a_mirror_image_that_is_stretched():
+    class Pedestrian(crossing.Pedestrian):
+        def mirrored(self, features):
+            image = super().mirrored(features)
+            doubled = jnp.linalg.norm(image[..., 2:4], axis=-1, keepdims=True) < 1.5
+            way = image[..., 2:4] * jnp.where(doubled, 2.0, 0.5)  # no unit vector
+            return jnp.concatenate([image[..., :2], way, image[..., 4:]], axis=-1)
+
+    return with_pedestrian(Pedestrian)
+
+
 @mutant("mirror images", r"mirrored of the source of 'pedestrian' takes hits to situations without")
 def hits_on_the_left_only():
     class Pedestrian(crossing.Pedestrian):

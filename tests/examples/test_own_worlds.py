@@ -122,8 +122,9 @@ def test_threats_of_a_body_depend_on_where_it_swings_to():
     assert towards.max() > 0.1 > away.max()
 
 
-def test_an_agent_without_symmetry_mirrors_nothing_and_a_lopsided_one_is_refused():
+def test_a_body_without_symmetry_and_a_lopsided_one_are_refused():
     body = world.make_agent()
-    np.testing.assert_array_equal(body.replace(mirror=None).mirrored_threats(), np.arange(9))
+    with pytest.raises(ValueError, match="mirror is None; it must be given where a hazard"):
+        body.replace(mirror=None).mirrored_threats()
     with pytest.raises(ValueError, match="actions: the table holds no mirror image"):
         body.replace(actions=body.actions[1:]).mirrored_threats()

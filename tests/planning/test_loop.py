@@ -14,6 +14,7 @@ from rp_jax.envs import tally
 from rp_jax.planning import loop
 from rp_jax.planning.dqn import DQNConfig
 from rp_jax.planning.loop import LoopConfig
+from rp_jax.planning.percept import Percept
 
 PARAMS = probe.make_params()
 CONFIG = LoopConfig(
@@ -391,7 +392,8 @@ def test_the_carried_view_is_that_of_the_carried_states():
     ],
 )
 def test_an_inadmissible_action_is_known_by_its_threat(threat, action, x, wrong):
-    seen = loop.Seen(None, jnp.asarray([threat, threat]), None, None, jnp.asarray([x, x]))
+    threats, thresholds = jnp.asarray([threat, threat]), jnp.asarray([x, x])
+    seen = Percept(None, None, None, threats, thresholds)
     found = loop._inadmissible(seen, jnp.asarray([action, action]))
     np.testing.assert_array_equal(found, [wrong, wrong])
 
@@ -402,7 +404,7 @@ def test_inadmissible_actions_are_counted_if_there_are_any(compile_soon):
     beside = jax.vmap(probe.start_at)(jnp.full(32, 5.0))
     # A mask that lets all walk into the pit.
     forged = jnp.tile(jnp.arange(3) == probe.RIGHT, (32, 1))
-    honest = jax.jit(loop._look)(pmdp, beside)
+    honest = jax.jit(type(pmdp).perceive)(pmdp, beside)
     seen = honest._replace(admissible=forged)
     forced = state._replace(states=beside, seen=seen)
     network = loop.make_network(CONFIG, pmdp)

@@ -6,7 +6,7 @@ from rp_jax.envs.check.batches import join
 from rp_jax.envs.check.problems import number_of
 from rp_jax.envs.check.trial import Steps, Trial
 
-TURNED = 5e-3  # share of hits that rounding may turn over
+TURNED = 1e-3  # share of hits that rounding may turn over, or one of several
 TOUCHING = 1e-4  # of a clearance: rounding
 
 
@@ -77,7 +77,8 @@ def _wrong_collisions(
 
 def _unless_few(bad: np.ndarray, among: np.ndarray, before: str, after: str) -> list[str]:
     """A sentence on how many of some steps are bad, unless rounding may be the reason."""
-    if bad.sum() <= TURNED * among.sum():
+    count, most = int(bad.sum()), int(among.sum())
+    if count == 0 or (count < most and count <= max(1, TURNED * most)):
         return []
     space = "" if after.startswith(";") else " "
-    return [f"{before} {number_of(int(bad.sum()), int(among.sum()), 'steps')}{space}{after}"]
+    return [f"{before} {number_of(count, most, 'steps')}{space}{after}"]

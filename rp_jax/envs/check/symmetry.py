@@ -49,7 +49,16 @@ def _of_kind(trial: Trial, pairs: Pairs) -> list[str]:
             f"when it is applied twice (in {where}); the mirror image of a mirror image must be "
             "the original"
         ]
+    if beyond(pairs.features(*pairs.restore(features)), features, tolerance).mean() > RARE:
+        return []  # what is wrong with `state_of` is told elsewhere
     other = pairs.restore(image)
+    bad = beyond(pairs.features(*other), image, tolerance)
+    if bad.mean() > RARE:
+        row, where = int(np.argmax(bad)), number_of(int(bad.sum()), len(bad), "pairs")
+        return [
+            f"mirrored of {name} gives features that no pair has, such as {value_of(image[row])} "
+            f"(in {where}); `state_of` must find a pair with the mirrored features"
+        ]
     found = _hits_differ(name, pairs, pair, other)
     found += _actions_differ(trial, name, pairs, pair, other, tolerance)
     return found or _chances_differ(trial, name, pairs, pair, other, tolerance)
