@@ -57,7 +57,7 @@ def train(config: Config) -> Iterator[dict[str, float]]:
     learning = dataclasses.replace(settings.planning, steps=config.steps)
     traces = 0
 
-    def counted(state: loop.LoopState, pmdp: PMDP) -> tuple[loop.LoopState, loop.Metrics]:
+    def counted(state: loop.LoopState, pmdp: PMDP) -> tuple[loop.LoopState, loop.LoopMetrics]:
         nonlocal traces
         traces += 1
         return loop.chunk(state, pmdp, learning, CHUNK)

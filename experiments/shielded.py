@@ -139,7 +139,7 @@ def played(
     env, params = brax.training.VmapWrapper(brax.BraxEnv(pmdp.env, pmdp.params)), pmdp.params
     if discrete:
         threat = lambda state: pmdp.threat(state.pipeline_state, state.done == 0)  # noqa: E731
-        env = brax.Shielded(env, threat, pmdp.x, policy.table)
+        env = brax.ShieldWrapper(env, threat, pmdp.x, policy.table)
     start_key, play_key = jax.random.split(key)
     starts = env.reset(jax.random.split(start_key, ROUND))
     no = jnp.zeros(ROUND, bool)

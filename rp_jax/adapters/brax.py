@@ -198,7 +198,7 @@ def wrap(
     return FreshResets(training.EpisodeWrapper(training.VmapWrapper(env), limit, action_repeat))
 
 
-class Shielded(Wrapper):
+class ShieldWrapper(Wrapper):
     """A wrapper that replaces inadmissible actions by admissible ones, whatever the policy.
 
     It works for any brax environment, batched or not. `info` and `metrics` report for each step

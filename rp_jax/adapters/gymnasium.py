@@ -15,7 +15,7 @@ import numpy as np
 from rp_jax import shield
 from rp_jax.adapters import registry
 from rp_jax.envs import autoreset, optional
-from rp_jax.envs.contract import Env as JaxEnv
+from rp_jax.envs.contract import Env
 from rp_jax.validate import number, positive
 
 try:
@@ -30,7 +30,7 @@ except ImportError as error:
 FARTHEST = 100.0  # bound of observations beside the LIDAR; gymnasium wants a finite one
 
 
-def _spaces(env: JaxEnv, params: Any) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Discrete]:
+def _spaces(env: Env, params: Any) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Discrete]:
     """Returns the spaces of observations and actions; LIDAR values are in [0, 1]."""
     bins = optional.lidar_bins(env)
     sizes = bins, optional.observation_size(env, params) - bins
@@ -72,7 +72,7 @@ def _key(env: Any) -> jax.Array:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _start(env: JaxEnv, key: jax.Array, params: Any) -> tuple:
+def _start(env: Env, key: jax.Array, params: Any) -> tuple:
     """Returns the next key, a new start, and its observation."""
     key, now = jax.random.split(key)
     state = env.reset(now, params)
@@ -80,7 +80,7 @@ def _start(env: JaxEnv, key: jax.Array, params: Any) -> tuple:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _advance(env: JaxEnv, key: jax.Array, state: Any, action: Any, params: Any) -> tuple:
+def _advance(env: Env, key: jax.Array, state: Any, action: Any, params: Any) -> tuple:
     """Returns the next key, the state after a step, its observation, and the outcome."""
     key, now = jax.random.split(key)
     reached, outcome = env.step(now, state, action, params)
@@ -88,7 +88,7 @@ def _advance(env: JaxEnv, key: jax.Array, state: Any, action: Any, params: Any) 
 
 
 @functools.partial(jax.jit, static_argnums=(0, 2))
-def _start_all(env: JaxEnv, key: jax.Array, count: int, params: Any) -> tuple:
+def _start_all(env: Env, key: jax.Array, count: int, params: Any) -> tuple:
     """Returns the next key, new starts (count,), and their observations."""
     key, now = jax.random.split(key)
     states = jax.vmap(env.reset, (0, None))(jax.random.split(now, count), params)
@@ -96,7 +96,7 @@ def _start_all(env: JaxEnv, key: jax.Array, count: int, params: Any) -> tuple:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _advance_all(env: JaxEnv, key: jax.Array, states: Any, actions: Any, params: Any) -> tuple:
+def _advance_all(env: Env, key: jax.Array, states: Any, actions: Any, params: Any) -> tuple:
     """Makes a step of a batch.
 
     Returns:
@@ -110,7 +110,7 @@ def _advance_all(env: JaxEnv, key: jax.Array, states: Any, actions: Any, params:
     return key, *carried, reached[1], outcome
 
 
-class Env(gymnasium.Env[np.ndarray, np.int64]):
+class JaxEnv(gymnasium.Env[np.ndarray, np.int64]):
     """A single environment with its state in `state` and the danger of a step in `info["cost"]`."""
 
     metadata = {"render_modes": []}  # noqa: RUF012 (gymnasium's way)
@@ -359,7 +359,7 @@ class Shielded(gymnasium.Wrapper):
 for _name in registry.ENVS:
     gymnasium.register(
         f"rp_jax/{_name.title().replace('_', '')}-v0",
-        entry_point="rp_jax.adapters.gymnasium:Env",
+        entry_point="rp_jax.adapters.gymnasium:JaxEnv",
         vector_entry_point="rp_jax.adapters.gymnasium:JaxVectorEnv",
         kwargs={"name": _name},
     )

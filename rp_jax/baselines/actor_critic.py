@@ -83,7 +83,7 @@ class Spread(NamedTuple):
         return jnp.where(self.squares > 0, jnp.sqrt(self.squares / self.steps), 1.0)
 
 
-class State(NamedTuple):
+class ActorCriticState(NamedTuple):
     """The state of the learner between two batches."""
 
     states: Any  # (B,) environment states
@@ -107,7 +107,7 @@ class Batch(NamedTuple):
     target: Array  # (N, 2) values that the critic should have predicted
 
 
-class Metrics(NamedTuple):
+class ActorCriticMetrics(NamedTuple):
     """Sums over a batch, to be divided by `episodes` or `steps`."""
 
     steps: Array  # () number of steps
@@ -181,7 +181,7 @@ def driver(
     return choose
 
 
-def init(key: Array, pmdp: PMDP, config: ActorCriticConfig) -> State:
+def init(key: Array, pmdp: PMDP, config: ActorCriticConfig) -> ActorCriticState:
     """Starts all environments, a policy and a critic.
 
     Args:
@@ -196,7 +196,7 @@ def init(key: Array, pmdp: PMDP, config: ActorCriticConfig) -> State:
     critic = make_critic(pmdp).init(critic_key, encoded, elapsed_of(states, pmdp))
     nothing = jnp.zeros(config.num_envs)
     zero = jnp.zeros(())
-    return State(
+    return ActorCriticState(
         states=states,
         running=tally.Running(nothing, nothing),
         earned=nothing,
@@ -254,8 +254,8 @@ def _advantages(steps: _Step, scale: Array, config: ActorCriticConfig) -> Array:
 
 
 def collect(
-    key: Array, state: State, pmdp: PMDP, config: ActorCriticConfig
-) -> tuple[State, Batch, Metrics]:
+    key: Array, state: ActorCriticState, pmdp: PMDP, config: ActorCriticConfig
+) -> tuple[ActorCriticState, Batch, ActorCriticMetrics]:
     """Lets all environments act for `length` steps, without learning.
 
     `pmdp.penalty` is subtracted from the reward per unit of danger. Values and advantages of reward
@@ -293,7 +293,7 @@ def collect(
         earned = config.gamma * earned + reward
         dtype = ended.score.dtype
         bad_observation, bad_signal = faults(encoded, signal)
-        metrics = Metrics(
+        metrics = ActorCriticMetrics(
             steps=jnp.asarray(config.num_envs, dtype),
             **ended._asdict(),
             bad_observations=jnp.sum(bad_observation, dtype=dtype),
@@ -320,7 +320,9 @@ def collect(
     return state, batch, metrics
 
 
-def update_critic(state: State, batch: Batch, pmdp: PMDP, config: ActorCriticConfig) -> State:
+def update_critic(
+    state: ActorCriticState, batch: Batch, pmdp: PMDP, config: ActorCriticConfig
+) -> ActorCriticState:
     """Makes one gradient step of both values towards their targets.
 
     Args:

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.sparse.linalg import cg
 
 from rp_jax.baselines import actor_critic
-from rp_jax.baselines.actor_critic import DANGER, REWARD, ActorCriticConfig, Batch, State
+from rp_jax.baselines.actor_critic import DANGER, REWARD, ActorCriticConfig, ActorCriticState, Batch
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import number
 
@@ -52,10 +52,10 @@ class Update(NamedTuple):
     accepted: Array  # () bool, the line search found a step
 
 
-class Metrics(NamedTuple):
-    """Metrics of one step of the learner."""
+class CPOMetrics(NamedTuple):
+    """CPOMetrics of one step of the learner."""
 
-    rollout: actor_critic.Metrics
+    rollout: actor_critic.ActorCriticMetrics
     update: Update
 
 
@@ -208,7 +208,7 @@ def improve(
     return unravel(theta), Update(kl, case, accepted)
 
 
-def init(key: Array, pmdp: PMDP, config: CPOConfig) -> State:
+def init(key: Array, pmdp: PMDP, config: CPOConfig) -> ActorCriticState:
     """Starts all environments, a policy and a critic.
 
     Args:
@@ -219,7 +219,9 @@ def init(key: Array, pmdp: PMDP, config: CPOConfig) -> State:
     return actor_critic.init(key, pmdp, config.rollout)
 
 
-def step(state: State, pmdp: PMDP, limit: Array, config: CPOConfig) -> tuple[State, Metrics]:
+def step(
+    state: ActorCriticState, pmdp: PMDP, limit: Array, config: CPOConfig
+) -> tuple[ActorCriticState, CPOMetrics]:
     """Collects a batch, then improves policy and critic.
 
     To be compiled with `compiler_options`.
@@ -242,9 +244,9 @@ def step(state: State, pmdp: PMDP, limit: Array, config: CPOConfig) -> tuple[Sta
     network = actor_critic.make_actor(pmdp, config.rollout)
     actor, update = improve(state.actor, network, batch, excess, config)
 
-    def learn(state: State, part: Batch) -> State:
+    def learn(state: ActorCriticState, part: Batch) -> ActorCriticState:
         return actor_critic.update_critic(state, part, pmdp, config.rollout)
 
     state = state._replace(actor=actor, key=key)
     state = actor_critic.pass_over(fit_key, state, batch, learn, config.rollout)
-    return state, Metrics(metrics, update)
+    return state, CPOMetrics(metrics, update)

@@ -288,7 +288,7 @@ def _distinct(fan: Node, ended: Array) -> Array:
     return ~jnp.any(jnp.tril(alike, -1), axis=-1)
 
 
-class Seen(NamedTuple):
+class TrueState(NamedTuple):
     """The observation that MPC gets: the state itself."""
 
     states: Any  # states of the environment, leading axis (B,)
@@ -299,7 +299,7 @@ class Omniscient(PMDP):
     """A P-MDP for policies that observe the state itself; learners get a `PMDP`."""
 
     def perceive(self, states: Any, alive: Array | None = None) -> Percept:
-        """Returns the percept of a `PMDP`, with a `Seen` in place of the observation.
+        """Returns the percept of a `PMDP`, with a `TrueState` in place of the observation.
 
         Args:
             states: states, leading axis (B,).
@@ -307,7 +307,7 @@ class Omniscient(PMDP):
         """
         needed = jnp.ones(states.time.shape, bool) if alive is None else alive
         percept = super().perceive(states, alive)
-        return percept._replace(encoded=Seen(states, needed))  # type: ignore[arg-type]
+        return percept._replace(encoded=TrueState(states, needed))  # type: ignore[arg-type]
 
 
 def omniscient(search: Search) -> Omniscient:

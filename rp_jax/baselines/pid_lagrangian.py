@@ -50,18 +50,18 @@ class Controller(NamedTuple):
     danger: Array  # () danger of an episode, as measured last
 
 
-class State(NamedTuple):
+class PIDState(NamedTuple):
     """The state of the learner between two batches."""
 
-    learner: actor_critic.State  # environments, policy and critic
+    learner: actor_critic.ActorCriticState  # environments, policy and critic
     actor_opt: optax.OptState  # state of the policy's optimiser
     controller: Controller  # memory of the penalty's controller
 
 
-class Metrics(NamedTuple):
-    """Metrics of one step of the learner."""
+class PIDMetrics(NamedTuple):
+    """PIDMetrics of one step of the learner."""
 
-    rollout: actor_critic.Metrics
+    rollout: actor_critic.ActorCriticMetrics
     penalty: Array  # () lambda, the penalty per unit of danger
 
 
@@ -143,7 +143,7 @@ def penalised(advantage: Array, penalty: Array) -> Array:
     return (gain - jnp.mean(gain)) / (jnp.std(gain) + SMALL)
 
 
-def init(key: Array, pmdp: PMDP, config: PIDConfig) -> State:
+def init(key: Array, pmdp: PMDP, config: PIDConfig) -> PIDState:
     """Starts all environments, a policy and a critic; the penalty starts at 0.
 
     Args:
@@ -154,10 +154,12 @@ def init(key: Array, pmdp: PMDP, config: PIDConfig) -> State:
     learner = actor_critic.init(key, pmdp, config.rollout)
     nothing = jnp.zeros(())
     opt = optax.adam(config.learning_rate).init(learner.actor)
-    return State(learner, opt, Controller(nothing, nothing))
+    return PIDState(learner, opt, Controller(nothing, nothing))
 
 
-def step(state: State, pmdp: PMDP, limit: Array, config: PIDConfig) -> tuple[State, Metrics]:
+def step(
+    state: PIDState, pmdp: PMDP, limit: Array, config: PIDConfig
+) -> tuple[PIDState, PIDMetrics]:
     """Collects a batch, adapts the penalty, then improves policy and critic.
 
     Args:
@@ -198,4 +200,4 @@ def step(state: State, pmdp: PMDP, limit: Array, config: PIDConfig) -> tuple[Sta
 
     carry = (learner._replace(key=key), state.actor_opt, jnp.asarray(True))
     learner, opt, _ = actor_critic.pass_over(fit_key, carry, items, update, rollout)
-    return State(learner, opt, controller), Metrics(metrics, penalty)
+    return PIDState(learner, opt, controller), PIDMetrics(metrics, penalty)

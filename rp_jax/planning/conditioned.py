@@ -19,7 +19,7 @@ from rp_jax.shield import rounded_down
 from rp_jax.validate import number
 
 
-class State(struct.PyTreeNode):
+class ConditionedState(struct.PyTreeNode):
     """A state of the environment, with the threshold of its episode."""
 
     inner: Any  # the environment's state
@@ -36,7 +36,7 @@ class State(struct.PyTreeNode):
         return self.inner.time
 
 
-class Params(struct.PyTreeNode):
+class ConditionedParams(struct.PyTreeNode):
     """The environment's parameters, with the range of x."""
 
     inner: Any  # the environment's parameters
@@ -54,7 +54,7 @@ class Params(struct.PyTreeNode):
         return self.inner.time_limit
 
 
-def make_params(inner: Any, low: float, high: float) -> Params:
+def make_params(inner: Any, low: float, high: float) -> ConditionedParams:
     """Returns parameters with thresholds spread evenly over the orders of magnitude of a range.
 
     Args:
@@ -68,7 +68,7 @@ def make_params(inner: Any, low: float, high: float) -> Params:
     number("low", low, above=0)
     number("high", high, least=low)
     least, most = (jnp.asarray(rounded_down(x), float) for x in (low, high))
-    return Params(inner, least, most)
+    return ConditionedParams(inner, least, most)
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Conditioned:
         scale = optional.scale(self.env)
         return (*scale, 1.0) if scale else ()
 
-    def reset(self, key: Array, params: Params) -> State:
+    def reset(self, key: Array, params: ConditionedParams) -> ConditionedState:
         """Draws a start and a threshold.
 
         Args:
@@ -99,11 +99,11 @@ class Conditioned:
         low, high = jnp.log(params.low), jnp.log(params.high)
         x = jnp.exp(low + jax.random.uniform(draw, (), low.dtype) * (high - low))
         x = jnp.clip(x, params.low, params.high)
-        return State(self.env.reset(start, params.inner), x)
+        return ConditionedState(self.env.reset(start, params.inner), x)
 
     def step(
-        self, key: Array, state: State, action: Array, params: Params
-    ) -> tuple[State, Outcome]:
+        self, key: Array, state: ConditionedState, action: Array, params: ConditionedParams
+    ) -> tuple[ConditionedState, Outcome]:
         """Makes one transition of the environment; the threshold stays the same.
 
         Args:
@@ -118,7 +118,7 @@ class Conditioned:
         inner, outcome = self.env.step(key, state.inner, action, params.inner)
         return state.replace(inner=inner), outcome
 
-    def threshold(self, state: State) -> Array:
+    def threshold(self, state: ConditionedState) -> Array:
         """Returns the largest admissible threat of a state's episode, ().
 
         Args:
@@ -126,7 +126,7 @@ class Conditioned:
         """
         return state.x
 
-    def observe(self, state: State, params: Params) -> Array:
+    def observe(self, state: ConditionedState, params: ConditionedParams) -> Array:
         """Returns the environment's observation, with half of log10 x appended.
 
         Args:
@@ -136,7 +136,7 @@ class Conditioned:
         seen = self.env.observe(state.inner, params.inner)
         return jnp.concatenate([seen, 0.5 * jnp.log10(state.x)[None].astype(seen.dtype)])
 
-    def hazards(self, state: State, params: Params) -> dict[str, Hazards]:
+    def hazards(self, state: ConditionedState, params: ConditionedParams) -> dict[str, Hazards]:
         """Returns, by kind, the hazards that `sub_rmdps` has threats for.
 
         Args:
@@ -145,7 +145,7 @@ class Conditioned:
         """
         return self.env.hazards(state.inner, params.inner)
 
-    def collisions(self, state: State, params: Params) -> dict[str, Array]:
+    def collisions(self, state: ConditionedState, params: ConditionedParams) -> dict[str, Array]:
         """Returns, by kind, whether a hazard is being hit, () bool each.
 
         Args:
@@ -154,7 +154,7 @@ class Conditioned:
         """
         return optional.collisions(self.env, state.inner, params.inner)
 
-    def clearance(self, position: Array, params: Params) -> Array:
+    def clearance(self, position: Array, params: ConditionedParams) -> Array:
         """Returns the distance left between the body and the nearest fixed hazard, () room units.
 
         Args:
@@ -163,7 +163,7 @@ class Conditioned:
         """
         return optional.clearance(self.env, position, params.inner)
 
-    def sub_rmdps(self, params: Params) -> dict[str, SubRMDP]:
+    def sub_rmdps(self, params: ConditionedParams) -> dict[str, SubRMDP]:
         """Returns, by kind, the sub-R-MDP of the body and one hazard.
 
         Args:
@@ -171,7 +171,7 @@ class Conditioned:
         """
         return self.env.sub_rmdps(params.inner)
 
-    def num_actions(self, params: Params) -> int:
+    def num_actions(self, params: ConditionedParams) -> int:
         """Returns the size of the discrete action set.
 
         Args:

@@ -80,7 +80,7 @@ class LoopConfig:
         return self.batch * self.updates / self.num_envs
 
 
-class Metrics(NamedTuple):
+class LoopMetrics(NamedTuple):
     """Sums over a chunk of iterations, to be divided by `episodes` or `steps`."""
 
     steps: Array
@@ -171,7 +171,7 @@ def _choose(key: Array, values: Array, admissible: Array, epsilon: Array) -> Arr
 
 def interact(
     key: Array, state: LoopState, pmdp: PMDP, network: nn.Module, config: LoopConfig
-) -> tuple[LoopState, Metrics]:
+) -> tuple[LoopState, LoopMetrics]:
     """Takes one step of every environment, and learns nothing.
 
     Args:
@@ -211,7 +211,7 @@ def interact(
     running, ended = tally.tally(state.running, outcome)
     dtype = ended.score.dtype
     bad_observation, bad_threat = faults(state.seen.encoded, state.seen.threat)
-    metrics = Metrics(
+    metrics = LoopMetrics(
         steps=jnp.asarray(batch, dtype),
         **ended._asdict(),
         insecure=jnp.sum(~state.seen.secure, dtype=dtype),
@@ -273,7 +273,7 @@ def begin(key: Array, pmdp: PMDP, config: LoopConfig) -> LoopState:
     )
 
 
-def init(key: Array, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics]:
+def init(key: Array, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, LoopMetrics]:
     """Returns `begin` with a replay filled by real steps, and the metrics of these.
 
     Args:
@@ -305,7 +305,7 @@ def _oldest(window: Taken, config: LoopConfig) -> Transition:
     return jax.vmap(n_step_transition, (1, None))(window, config.learner.gamma)
 
 
-def collect(state: LoopState, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, Metrics]:
+def collect(state: LoopState, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, LoopMetrics]:
     """Takes one step of every environment, and stores the transitions.
 
     Args:
@@ -359,7 +359,7 @@ def chunk(
     config: LoopConfig,
     iterations: int | Array,
     updates: int | Array | None = None,
-) -> tuple[LoopState, Metrics]:
+) -> tuple[LoopState, LoopMetrics]:
     """Collects and learns, several times.
 
     Where both numbers are traced, one compiled program fills the replay (0 updates) and learns.
@@ -378,7 +378,7 @@ def chunk(
         number("iterations", iterations, least=1, integer=True)
     updates = config.updates if updates is None else updates
 
-    def iteration(_, carry: tuple[LoopState, Metrics]) -> tuple[LoopState, Metrics]:
+    def iteration(_, carry: tuple[LoopState, LoopMetrics]) -> tuple[LoopState, LoopMetrics]:
         state, sums = carry
         state, metrics = collect(state, pmdp, config)
         keys = jax.random.split(state.key, 1 + config.updates)
@@ -391,11 +391,11 @@ def chunk(
         state, loss = jax.lax.fori_loop(0, updates, update, start)
         return state, jax.tree.map(jnp.add, sums, metrics._replace(loss=loss))
 
-    nothing = Metrics(*[jnp.zeros((), state.running.score.dtype)] * len(Metrics._fields))
+    nothing = LoopMetrics(*[jnp.zeros((), state.running.score.dtype)] * len(LoopMetrics._fields))
     return jax.lax.fori_loop(0, iterations, iteration, (state, nothing))
 
 
-def check(params: Any, metrics: Metrics) -> None:
+def check(params: Any, metrics: LoopMetrics) -> None:
     """Raises FloatingPointError if something in a chunk was not a finite number, naming it.
 
     The weights tell of gradients: Adam never forgets one that is not finite.

@@ -100,7 +100,8 @@ def picture(scene: Scene, bodies: Sequence[Pose], path: Path, width: float = 2.0
     axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     colours = [AGENT, *(scene.colours or [OBSTACLE] * (len(bodies) - 1))]
     for body, colour in zip(bodies, colours, strict=True):
-        axis.add_patch(Circle(body.position, scene.radius, color=colour, zorder=4))
+        x, y = body.position
+        axis.add_patch(Circle((x, y), scene.radius, color=colour, zorder=4))
         tip = np.asarray(body.position) + 1.8 * scene.radius * np.asarray(body.heading)
         axis.plot(*np.stack([body.position, tip]).T, color="black", linewidth=1.2, zorder=5)
     figure.savefig(path, dpi=100)

@@ -124,7 +124,7 @@ def plan(
     if where is not None and (where / saved.AGENTS / "manifest.json").exists():
         return _finished(where, pmdp, threat, record.plain(spec))
     with record.job(where, "plan", {**spec, **record.machine(env)}) as checkpoints:
-        learner = Learner(
+        learner = Training(
             pmdp, members, config, penalty, learning_penalty_from, where, on_progress, on_metrics
         )
         keys = numbered(key_of(key, Stream.PLANNING), [member.seed for member in members])
@@ -235,7 +235,7 @@ def _finished(
     return saved.restored_agents(folder, about, pmdp, threat)
 
 
-class Learner(NamedTuple):
+class Training(NamedTuple):
     """Agents that learn side by side, their world, and where their progress is told."""
 
     pmdp: PMDP
@@ -264,7 +264,7 @@ class Programs(NamedTuple):
     """Compiled programs, for all agents side by side."""
 
     begin: Callable[..., LoopState]  # (keys, pmdp): as `loop.begin`
-    chunk: Callable[..., tuple[LoopState, loop.Metrics]]  # (state, pmdp, iterations, updates)
+    chunk: Callable[..., tuple[LoopState, loop.LoopMetrics]]  # (state, pmdp, iterations, updates)
     emptied: Callable[[LoopState], LoopState]  # as `loop.emptied`
 
 
@@ -300,7 +300,7 @@ def compiled(
     )
 
 
-def learned(keys: Array, learner: Learner, mesh: Mesh | None, checkpoints: Checkpoints) -> Agents:
+def learned(keys: Array, learner: Training, mesh: Mesh | None, checkpoints: Checkpoints) -> Agents:
     """Trains all agents as one program, chunk by chunk.
 
     Args:
@@ -331,7 +331,7 @@ def learned(keys: Array, learner: Learner, mesh: Mesh | None, checkpoints: Check
         return state, sharing.gather(metrics, mesh)._asdict()
 
     def check(params: Any, metrics: dict[str, Any]) -> None:
-        loop.check(sharing.gather(params, mesh), loop.Metrics(**metrics))
+        loop.check(sharing.gather(params, mesh), loop.LoopMetrics(**metrics))
 
     def more(sums: Mapping[str, float]) -> dict[str, Any]:
         return {
@@ -369,7 +369,7 @@ def learned(keys: Array, learner: Learner, mesh: Mesh | None, checkpoints: Check
 
 def _filled(
     programs: Programs, keys: Array, pmdp: PMDP, config: LoopConfig
-) -> tuple[LoopState, loop.Metrics]:
+) -> tuple[LoopState, loop.LoopMetrics]:
     """As `loop.init`, by compiled programs."""
     state = programs.begin(keys, pmdp)
     if not config.opening:
@@ -379,7 +379,7 @@ def _filled(
     return state, jax.tree.map(jnp.add, opening, filled)
 
 
-def _counted(filled: loop.Metrics, chunks: int) -> dict[str, np.ndarray]:
+def _counted(filled: loop.LoopMetrics, chunks: int) -> dict[str, np.ndarray]:
     """(chunks, n) by name: what filled the replay belongs to the first chunk."""
     metrics = {}
     for name, part in filled._asdict().items():

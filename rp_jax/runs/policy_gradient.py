@@ -208,7 +208,7 @@ def _learned(
         return state, jax.tree.map(lambda m: jnp.sum(m, axis=0), metrics)
 
     def more(sums: Mapping[str, float]) -> dict[str, Any]:
-        counted = actor_critic.Metrics._fields
+        counted = actor_critic.ActorCriticMetrics._fields
         return {key: value / length for key, value in sums.items() if key not in counted}
 
     learners.on_progress(learners.stage, 0, chunks, "compiling")
@@ -225,8 +225,8 @@ def _learned(
 
     def step(_: int, state: Any) -> tuple[Any, dict[str, Array]]:
         state, metrics = improve(state, pmdp, c)
-        counts = {key: metrics[key] for key in actor_critic.Metrics._fields}
-        none_bad(name, actor_critic.Metrics(**counts))
+        counts = {key: metrics[key] for key in actor_critic.ActorCriticMetrics._fields}
+        none_bad(name, actor_critic.ActorCriticMetrics(**counts))
         # Not finite, it stops CPO without a word: no step is then accepted.
         critic = _learner(state).critic
         finite(f"{name}: values' weights", jax.flatten_util.ravel_pytree(critic)[0])
@@ -255,14 +255,14 @@ def _learned(
     )
 
 
-def _learner(state: Any) -> actor_critic.State:
+def _learner(state: Any) -> actor_critic.ActorCriticState:
     """Policy and critic, in the state of either method."""
-    return state if isinstance(state, actor_critic.State) else state.learner
+    return state if isinstance(state, actor_critic.ActorCriticState) else state.learner
 
 
 def _update_facts(metrics: Any) -> dict[str, Array]:
     """What an update of either method did, as numbers to be averaged."""
-    if isinstance(metrics, pid_lagrangian.Metrics):
+    if isinstance(metrics, pid_lagrangian.PIDMetrics):
         return {"multiplier": metrics.penalty}
     kl, case, accepted = metrics.update
     return {

@@ -73,7 +73,7 @@ def corollary_2(cmdp: FiniteCMDP, policy: Array, c: Array | float, factor: float
     return corollary_1(cmdp, greedy(threat(cmdp, policy).action), c, factor)
 
 
-class Certificate(NamedTuple):
+class DangerBound(NamedTuple):
     """The bound of danger that any function U of threats guarantees (docs/theory.md)."""
 
     least: Array  # (H, S) least values m_t = min_a U_t
@@ -81,7 +81,7 @@ class Certificate(NamedTuple):
     state: Array  # (H, S) bound of D_t for every policy inside the secure sets of U at x
 
 
-def certificate(cmdp: FiniteCMDP, upper: Array, x: Array | float) -> Certificate:
+def certificate(cmdp: FiniteCMDP, upper: Array, x: Array | float) -> DangerBound:
     """Returns the bound of the danger of all policies inside the secure sets of a function U.
 
     The bound is D_t <= m_t + sum_k beta^{k-t} E[1_S (x_k - m_k) + e_k], at the policy for which the
@@ -98,7 +98,7 @@ def certificate(cmdp: FiniteCMDP, upper: Array, x: Array | float) -> Certificate
     room = jnp.broadcast_to(x, least.shape[:1])[:, None] - least
     toll = jnp.where(allowed.secure, room, 0.0)[..., None] + excess
     spent = solve(cmdp, toll, cmdp.beta, sets.most, allowed.admissible)
-    return Certificate(least, excess, least + spent.state)
+    return DangerBound(least, excess, least + spent.state)
 
 
 def backup(cmdp: FiniteCMDP, upper: Array) -> Array:

@@ -183,7 +183,7 @@ def threat_of(state):
 @pytest.mark.parametrize("batched", [False, True])
 def test_no_inadmissible_action_passes_and_substitutes_are_counted(batched):
     env = brax.training.VmapWrapper(Counter()) if batched else Counter()
-    env = brax.Shielded(env, threat_of, 0.1)
+    env = brax.ShieldWrapper(env, threat_of, 0.1)
     step = jax.jit(env.step)
     state = env.reset(raws(0) if batched else raw(0))
     assert (state.info["intervention"] == 0).all()
@@ -199,11 +199,11 @@ def test_no_inadmissible_action_passes_and_substitutes_are_counted(batched):
 
 
 def test_scores_and_continuous_actions_give_way_to_the_next_best():
-    scored = brax.Shielded(Counter(), lambda state: jnp.asarray([0.9, 0.0, 0.0, 0.9]), 0.1)
+    scored = brax.ShieldWrapper(Counter(), lambda state: jnp.asarray([0.9, 0.0, 0.0, 0.9]), 0.1)
     state = scored.step(scored.reset(raw(0)), jnp.asarray([9.0, 1.0, 2.0, 3.0]))
     assert state.pipeline_state["action"] == 2
     table = jnp.asarray([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
-    nearest = brax.Shielded(Counter(True), scored.threat, 0.1, table)
+    nearest = brax.ShieldWrapper(Counter(True), scored.threat, 0.1, table)
     for wish, row, replaced in (([0.2, 0.1], 1, 1), ([0.1, 0.9], 2, 0), ([1.0, 1.5], 2, 1)):
         state = nearest.step(nearest.reset(raw(0)), jnp.asarray(wish))
         np.testing.assert_array_equal(state.pipeline_state["action"], table[row])
@@ -211,17 +211,17 @@ def test_scores_and_continuous_actions_give_way_to_the_next_best():
 
 
 def test_where_nothing_is_admissible_the_least_threatening_action_is_taken():
-    env = brax.Shielded(Counter(), lambda state: jnp.asarray([0.9, 0.7, 0.3, 0.8]), 0.1)
+    env = brax.ShieldWrapper(Counter(), lambda state: jnp.asarray([0.9, 0.7, 0.3, 0.8]), 0.1)
     state = env.step(env.reset(raw(0)), jnp.asarray(0))
     assert state.pipeline_state["action"] == 2
     assert state.info["insecure"] == state.metrics["insecure"] == 1
-    free = brax.Shielded(Counter(), env.threat, jnp.inf)
+    free = brax.ShieldWrapper(Counter(), env.threat, jnp.inf)
     state = free.step(free.reset(raw(0)), jnp.asarray(0))
     assert state.pipeline_state["action"] == state.info["intervention"] == 0
 
 
 def test_a_shield_inside_the_training_wrappers_counts_by_episode():
-    env = brax.Shielded(Counter(), threat_of, 0.1)
+    env = brax.ShieldWrapper(Counter(), threat_of, 0.1)
     env = brax.wrap(env, 100)
     state, step = jax.jit(env.reset)(raws(0)), jax.jit(env.step)
     count, counted = np.zeros(ROWS), 0

@@ -251,7 +251,7 @@ def test_one_of_the_best_is_drawn_and_no_other():
 
 
 def percept(states, alive):
-    return mpc.Percept(mpc.Seen(states, alive), None, None, None, None)
+    return mpc.Percept(mpc.TrueState(states, alive), None, None, None, None)
 
 
 def test_parameters_and_penalties_need_no_new_program():
@@ -285,7 +285,7 @@ def test_the_state_is_seen_by_nobody_else():
     search = search_of("jam", 2, num_obstacles=3)
     states = rows_of(crowded())
     seen = mpc.omniscient(search).perceive(states).encoded
-    assert isinstance(seen, mpc.Seen)
+    assert isinstance(seen, mpc.TrueState)
     np.testing.assert_array_equal(seen.states.obstacles.position, states.obstacles.position)
     assert seen.alive.all()
     plain = mpc.PMDP(

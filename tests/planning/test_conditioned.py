@@ -30,7 +30,7 @@ def jam_pmdp(x):
 def at(pmdp, states, x):
     wrapped = conditioned.condition(pmdp, x, x)
     count = len(states.time)
-    return wrapped, conditioned.State(states, jnp.full(count, x, jnp.float32))
+    return wrapped, conditioned.ConditionedState(states, jnp.full(count, x, jnp.float32))
 
 
 @pytest.mark.parametrize("x", XS)
@@ -54,7 +54,7 @@ def test_each_state_is_judged_by_the_threshold_of_its_own_episode():
     states = jax.vmap(jam.reset, (0, None))(jax.random.split(jax.random.key(0), 60), pmdp.params)
     xs = jnp.asarray(np.tile(XS, 20), jnp.float32)
     wrapped = conditioned.condition(pmdp, 0.05, 0.9)
-    found = jax.jit(type(wrapped).perceive)(wrapped, conditioned.State(states, xs))
+    found = jax.jit(type(wrapped).perceive)(wrapped, conditioned.ConditionedState(states, xs))
     np.testing.assert_array_equal(found.threshold, xs)
     within = np.asarray(found.threat) <= np.asarray(xs)[:, None]
     np.testing.assert_array_equal(found.secure, within.any(axis=1))
@@ -75,7 +75,7 @@ def test_without_a_shield_all_is_admissible_at_any_threshold():
 def test_the_threshold_is_seen_after_all_else():
     pmdp = probe.make_pmdp(probe, probe.make_params())
     wrapped = conditioned.condition(pmdp, 0.01, 1.0)
-    state = conditioned.State(probe.start_at(3), jnp.asarray(0.1))
+    state = conditioned.ConditionedState(probe.start_at(3), jnp.asarray(0.1))
     seen = wrapped.env.observe(state, wrapped.params)
     np.testing.assert_array_equal(seen[:-1], probe.observe(state.inner, pmdp.params))
     assert seen[-1] == pytest.approx(-0.5)  # half of log10 of 0.1

@@ -251,7 +251,7 @@ def test_no_key_is_used_twice(monkeypatch):
 
     def act(key, state, *_):
         note(key)
-        return state, loop.Metrics(*[0.0] * 12)
+        return state, loop.LoopMetrics(*[0.0] * 12)
 
     def learn(key, state, *_):
         note(key)
