@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from benchmarks.bound import Piece
 from benchmarks.measure import Row, measure, row_of
 from benchmarks.report import main
-from rp_jax.tabular import oracle, secure, threat, thresholds, verify
+from rp_jax.tabular import exact, oracle, secure, thresholds, verify
 from rp_jax.tabular.cmdp import FiniteCMDP
 
 STATES, ACTIONS, HORIZON, C = 8, 4, 20, 0.5
@@ -20,10 +20,10 @@ def solved(cmdp: FiniteCMDP) -> jax.Array:
 
     Returns the return, and the worst danger that any policy inside can do, as the proof, (2,).
     """
-    star = threat.least_threat(cmdp)
+    star = exact.least_threat(cmdp)
     chosen, planned = thresholds.planned(cmdp, C, star.policy, thresholds.by_evaluation)
     worst = secure.worst(cmdp, chosen.shield.admissible)
-    return jnp.stack([threat.expected(cmdp, planned), threat.expected(cmdp, worst)])
+    return jnp.stack([exact.expected(cmdp, planned), exact.expected(cmdp, worst)])
 
 
 def drawn(key: jax.Array, horizon: int = HORIZON) -> FiniteCMDP:
@@ -59,7 +59,7 @@ def run(batches: tuple[int, ...] = (1, 256, 4096), programs: int = 20) -> list[R
         few = [jax.tree.map(lambda leaf, i=i: leaf[i], few) for i in range(programs)]
         rates = []
         for cmdp in few:
-            least = float(threat.expected(cmdp, threat.least_threat(cmdp)))
+            least = float(exact.expected(cmdp, exact.least_threat(cmdp)))
             began = time.perf_counter()
             oracle.optimum(cmdp, max(C, least * (1 + 1e-9)))
             rates.append(1 / (time.perf_counter() - began))

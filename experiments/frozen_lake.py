@@ -17,7 +17,7 @@ import tyro
 from rp_jax import storage
 from rp_jax.cli import errors, terminal
 from rp_jax.cli.experiment import default_out
-from rp_jax.tabular import frozen_lake, oracle, secure, threat, thresholds
+from rp_jax.tabular import exact, frozen_lake, oracle, secure, thresholds
 from rp_jax.tabular.cmdp import FiniteCMDP
 from rp_jax.validate import number
 
@@ -65,18 +65,18 @@ def solve_all(lakes: FiniteCMDP, c: jax.Array) -> dict[str, Any]:
     def one(lake: FiniteCMDP, policy: jax.Array, c: jax.Array, rule: Any) -> dict[str, Any]:
         chosen, planned = thresholds.planned(lake, c, policy, rule)
         worst = secure.worst(lake, chosen.shield.admissible)
-        least = threat.greedy(threat.threat(lake, policy).action)
+        least = exact.greedy(exact.threat(lake, policy).action)
         return {
-            "baseline_danger": threat.expected(lake, threat.threat(lake, least)),
+            "baseline_danger": exact.expected(lake, exact.threat(lake, least)),
             "x": chosen.x,
-            "return_mean": threat.expected(lake, planned),
-            "danger": threat.expected(lake, threat.threat(lake, planned.policy)),
-            "worst_danger": threat.expected(lake, worst),
+            "return_mean": exact.expected(lake, planned),
+            "danger": exact.expected(lake, exact.threat(lake, planned.policy)),
+            "worst_danger": exact.expected(lake, worst),
         }
 
     def over(lake: FiniteCMDP, rule: Any) -> dict[str, Any]:
-        etas = threat.policy_iteration(lake, threat.uniform(lake), 2)
-        policies = jnp.stack([*etas, threat.least_threat(lake).policy])
+        etas = exact.policy_iteration(lake, exact.uniform(lake), 2)
+        policies = jnp.stack([*etas, exact.least_threat(lake).policy])
         over_c = jax.vmap(one, in_axes=(None, None, 0, None))
         return jax.vmap(over_c, in_axes=(None, 0, None, None))(lake, policies, c, rule)
 
@@ -180,7 +180,7 @@ def threat_map(config: Config) -> dict[str, Any]:
     """Returns T_0 of eta* on the map, where falling ends the episode: threats are probabilities."""
     horizon = config.horizons[0]
     lake = frozen_lake.frozen_lake(holes="paper", horizon=horizon, slip=config.slip)
-    action = threat.least_threat(lake).action[0]
+    action = exact.least_threat(lake).action[0]
     rows = frozen_lake.MAP_8X8
     cells = np.asarray(action[: len(rows) * len(rows[0])]).T  # without the end of the episode
     return {
@@ -214,19 +214,19 @@ def _cell(name: str, value: Any) -> str:
 
 def plot_map(shown: Mapping[str, Any], path: Path) -> None:
     """Draws figure 2, from what `threat_map` found."""
-    from rp_jax.plot import tabular
+    from rp_jax.plot import finite
 
     title = f"action threat of eta*, T = {shown['horizon']}"
     threats = np.asarray(shown["threat"])
-    tabular.lake(shown["rows"], threats, frozen_lake.ACTIONS, title, path)
+    finite.lake(shown["rows"], threats, frozen_lake.ACTIONS, title, path)
 
 
 def plot_rules(results: Mapping[str, Any], folder: Path) -> None:
     """Draws figures 3a and 3b, and the rules' shares of the optimum."""
-    from rp_jax.plot import tabular
+    from rp_jax.plot import finite
 
-    tabular.budgets(results["rows"], results["optima"], BASELINES, folder / "figure_3.png")
-    tabular.shares(results["rows"], tuple(thresholds.RULES), folder / "rules.png")
+    finite.budgets(results["rows"], results["optima"], BASELINES, folder / "figure_3.png")
+    finite.shares(results["rows"], tuple(thresholds.RULES), folder / "rules.png")
 
 
 def main() -> None:

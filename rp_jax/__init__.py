@@ -15,7 +15,7 @@ __version__ = version("rp_jax")
 if TYPE_CHECKING:
     from rp_jax.envs.check import EnvError, check_env
     from rp_jax.envs.contract import Env, Hazards, Outcome
-    from rp_jax.hazards.contract import HazardSource, SubRMDP
+    from rp_jax.hazards.source import HazardSource, SubRMDP
     from rp_jax.planning.loop import LoopConfig
     from rp_jax.planning.pmdp import PMDP
     from rp_jax.runs.agents import Agent, Agents
@@ -34,12 +34,12 @@ _HOMES = {
     "Certificate": "rp_jax.runs.certify",
     "Env": "rp_jax.envs.contract",
     "EnvError": "rp_jax.envs.check",
-    "HazardSource": "rp_jax.hazards.contract",
+    "HazardSource": "rp_jax.hazards.source",
     "Hazards": "rp_jax.envs.contract",
     "LoopConfig": "rp_jax.planning.loop",
     "Outcome": "rp_jax.envs.contract",
     "PMDP": "rp_jax.planning.pmdp",
-    "SubRMDP": "rp_jax.hazards.contract",
+    "SubRMDP": "rp_jax.hazards.source",
     "Table": "rp_jax.runs.tables",
     "ThreatConfig": "rp_jax.threat.build",
     "ThreatFunction": "rp_jax.threat.function",

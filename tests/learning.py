@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from rp_jax.baselines import actor_critic
 from rp_jax.baselines.actor_critic import ActorCriticConfig
-from rp_jax.tabular import threat
+from rp_jax.tabular import exact
 
 ROLLOUT = ActorCriticConfig(
     policy="categorical",
@@ -24,5 +24,5 @@ def danger_and_return(model, pmdp, actor):
     network = actor_critic.make_actor(pmdp, ROLLOUT)
     encoded = pmdp.perceive(finite.all_states(model)).encoded
     policy = jnp.exp(network.apply(actor, encoded).log_probs).reshape(model.shape)
-    harm, gain = threat.threat(model, policy), threat.returns(model, policy)
-    return float(threat.expected(model, harm)), float(threat.expected(model, gain))
+    harm, gain = exact.threat(model, policy), exact.returns(model, policy)
+    return float(exact.expected(model, harm)), float(exact.expected(model, gain))

@@ -194,24 +194,20 @@ def public_classes(tree):
     return [name for name in classes if not name.startswith("_")]
 
 
-# Names that are still taken twice; none may be added.
-TWICE = {"contract", "model", "tabular", "threat"}
-CLASSES_TWICE = {
-    *("Certificate", "Config", "Draws", "Env", "Learner", "Metrics", "Seen", "Shielded", "World"),
-}
 OF_EACH_ENVIRONMENT = {"State", "Params"}
 
 
 def test_no_two_modules_have_the_same_name():
     found = names_twice((name.rpartition(".")[2], name) for name in modules())
-    assert {name: homes for name, homes in found.items() if name not in TWICE} == {}
+    assert found == {}
 
 
 def test_no_two_public_classes_have_the_same_name():
     pairs = [(name, home) for home, tree in modules().items() for name in public_classes(tree)]
-    allowed = CLASSES_TWICE | OF_EACH_ENVIRONMENT
     found = names_twice(pairs)
-    assert {name: homes for name, homes in found.items() if name not in allowed} == {}
+    homes = [home for name in OF_EACH_ENVIRONMENT for home in found.pop(name)]
+    assert found == {}
+    assert all(home.startswith("rp_jax.envs.") for home in homes)
 
 
 def test_a_name_that_is_taken_would_be_noticed():

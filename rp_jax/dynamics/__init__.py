@@ -8,8 +8,8 @@ from rp_jax.dynamics.baseline import (
     independent_controls,
     make_plans,
 )
+from rp_jax.dynamics.body import Body, VehicleModel, delayed, num_threats
 from rp_jax.dynamics.geometry import angle_of, rotate, squared_distance, to_ego
-from rp_jax.dynamics.model import Body, VehicleModel, delayed, num_threats
 from rp_jax.dynamics.vehicle import Control, Vehicle, advance, make_vehicle
 
 __all__ = [

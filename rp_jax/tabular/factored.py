@@ -11,8 +11,8 @@ from flax import struct
 from jax import Array
 
 from rp_jax.tabular.cmdp import FiniteCMDP
+from rp_jax.tabular.exact import Values, threat
 from rp_jax.tabular.secure import plan, secure
-from rp_jax.tabular.threat import Values, threat
 from rp_jax.tabular.thresholds import certified
 
 

@@ -13,8 +13,8 @@ from jax import Array
 from scipy import optimize, sparse
 
 from rp_jax.tabular.cmdp import FiniteCMDP
+from rp_jax.tabular.exact import Values, expected, returns, solve, threat
 from rp_jax.tabular.secure import most
-from rp_jax.tabular.threat import Values, expected, returns, solve, threat
 from rp_jax.validate import number
 
 TOLERANCE = 1e-9  # primal and dual tolerance of HiGHS

@@ -11,7 +11,7 @@ from jax import Array
 from rp_jax import shield
 from rp_jax.shield import Shield
 from rp_jax.tabular.cmdp import FiniteCMDP
-from rp_jax.tabular.threat import Values, greedy, solve
+from rp_jax.tabular.exact import Values, greedy, solve
 
 
 def secure(action_threat: Array, x: Array | float) -> Shield:

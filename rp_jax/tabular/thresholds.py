@@ -14,7 +14,7 @@ from jax import Array
 from rp_jax.shield import Shield
 from rp_jax.tabular import secure as sets
 from rp_jax.tabular.cmdp import FiniteCMDP
-from rp_jax.tabular.threat import Values, check_policy, expected, greedy, solve, threat
+from rp_jax.tabular.exact import Values, check_policy, expected, greedy, solve, threat
 from rp_jax.validate import number
 
 PAPER, TIGHT = 2.0, 1.0  # factors of Theorems 1 and 2: as printed, and the least that is true

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rp_jax.tabular import factored, secure, threat, thresholds
+from rp_jax.tabular import exact, factored, secure, thresholds
 from rp_jax.tabular.cmdp import FiniteCMDP
 
 BETAS = (0.0, 0.5, 0.9, 0.999, 1 - 1e-6, 1.0)
@@ -85,7 +85,7 @@ def draw(key: Array, states: int, actions: int, horizon: int | None) -> Instance
     )
     eta, other = simplex(next(keys), chance(0.6, 2, h, *shape[:2]))
     eta = jnp.where(reached, free[None], eta)
-    found = threat.threat(cmdp, eta).action
+    found = exact.threat(cmdp, eta).action
     spread = jax.random.uniform(next(keys), maxval=found.max())
     at_value = jax.random.choice(next(keys), found.ravel()) * jnp.where(chance(0.3), 0.95, 1.0)
     at_value = jnp.where(chance(0.2), jnp.nextafter(at_value, -jnp.inf), at_value)
@@ -165,7 +165,7 @@ def theorem_1(case: Instance) -> Array:
         () the violation.
     """
     cmdp, eta, x = case.cmdp, case.eta, case.x
-    found = threat.threat(cmdp, eta)
+    found = exact.threat(cmdp, eta)
 
     def outside(action: Array, given: tuple) -> Array:
         _, threats, most = given
@@ -192,9 +192,9 @@ def theorem_2(case: Instance) -> Array:
         () the violation.
     """
     cmdp, x = case.cmdp, case.x
-    found = threat.threat(cmdp, case.eta)
-    greedy = threat.greedy(found.action)
-    improved = threat.threat(cmdp, greedy).state
+    found = exact.threat(cmdp, case.eta)
+    greedy = exact.greedy(found.action)
+    improved = exact.threat(cmdp, greedy).state
 
     def outside(action: Array, greedy: Array) -> Array:
         return jnp.sum(greedy * action, axis=1)
@@ -206,9 +206,9 @@ def theorem_2(case: Instance) -> Array:
     return jnp.max(jnp.stack(broken))
 
 
-def _danger(case: Instance, values: threat.Values) -> Array:
+def _danger(case: Instance, values: exact.Values) -> Array:
     """Returns the expected danger of an episode, ()."""
-    return threat.expected(case.cmdp, values)
+    return exact.expected(case.cmdp, values)
 
 
 def _steps(cmdp: FiniteCMDP) -> Array:
@@ -240,7 +240,7 @@ def corollary_1(case: Instance) -> Array:
         () the violation.
     """
     cmdp = case.cmdp
-    found = threat.threat(cmdp, case.eta)
+    found = exact.threat(cmdp, case.eta)
     c = _bound(case, _danger(case, found))
     x = thresholds.corollary_1(cmdp, case.eta, c)
 
@@ -252,7 +252,7 @@ def corollary_1(case: Instance) -> Array:
     broken = []
     for rule in SETS:
         data = (getattr(secure, rule)(found.action, x), found.action, found.state + 1e-12)
-        reached = threat.solve(cmdp, cmdp.danger, cmdp.beta, choose, data)
+        reached = exact.solve(cmdp, cmdp.danger, cmdp.beta, choose, data)
         broken.append(_danger(case, reached) - c)
     unsafe = _danger(case, found) > c
     return jnp.where(unsafe, jnp.where(x < 0, 0.0, 1.0), jnp.maximum(*broken))
@@ -271,8 +271,8 @@ def corollary_2(case: Instance) -> Array:
         () the violation.
     """
     cmdp = case.cmdp
-    found = threat.threat(cmdp, case.eta)
-    safest = _danger(case, threat.threat(cmdp, threat.greedy(found.action)))
+    found = exact.threat(cmdp, case.eta)
+    safest = _danger(case, exact.threat(cmdp, exact.greedy(found.action)))
     c = _bound(case, safest)
     x = thresholds.corollary_2(cmdp, case.eta, c)
     broken = [
@@ -292,8 +292,8 @@ def corollary_3(case: Instance) -> Array:
         () the violation.
     """
     cmdp = case.cmdp
-    star = threat.least_threat(cmdp)
-    others = [threat.threat(cmdp, policy).state for policy in (case.eta, case.other)]
+    star = exact.least_threat(cmdp)
+    others = [exact.threat(cmdp, policy).state for policy in (case.eta, case.other)]
     c = jnp.maximum(_danger(case, star), _bound(case, _danger(case, star)))
     x = thresholds.corollary_2(cmdp, star.policy, c)
     reached = secure.worst(cmdp, secure.secure(star.action, x).admissible)
@@ -313,7 +313,7 @@ def certificate(case: Instance) -> Array:
         () the violation.
     """
     cmdp, x = case.cmdp, case.x
-    found = threat.threat(cmdp, case.eta).action
+    found = exact.threat(cmdp, case.eta).action
     broken = []
     for upper in (found, found + 0.3 * case.noise, found * case.noise, case.noise):
         proved = thresholds.certificate(cmdp, upper, x)
@@ -354,10 +354,10 @@ def advantage(case: Instance) -> Array:
         () the violation.
     """
     cmdp, y = case.cmdp, case.x
-    found = threat.threat(cmdp, case.eta)
+    found = exact.threat(cmdp, case.eta)
     reached = secure.worst(cmdp, secure.secure_by_advantage(found, y).admissible)
     each = jnp.broadcast_to(y[:, None, None], cmdp.shape)
-    room = threat.evaluate(cmdp, each, cmdp.beta, case.eta).state  # sum beta^{k-t} y_k
+    room = exact.evaluate(cmdp, each, cmdp.beta, case.eta).state  # sum beta^{k-t} y_k
     return jnp.max(reached.state - found.state - room)
 
 
@@ -371,8 +371,8 @@ def evaluated(case: Instance) -> Array:
         () the violation.
     """
     cmdp = case.cmdp
-    found = threat.threat(cmdp, case.eta).action
-    safest = _danger(case, threat.threat(cmdp, threat.greedy(found)))
+    found = exact.threat(cmdp, case.eta).action
+    safest = _danger(case, exact.threat(cmdp, exact.greedy(found)))
     c = safest + case.share * jnp.maximum(0.2, safest)
     x = thresholds.evaluated(cmdp, found, c)
     beyond = jnp.min(jnp.where(found > x, found, jnp.inf))
@@ -456,7 +456,7 @@ def theorem_3(model: factored.Factored, etas: Array, x: Array) -> Array:
     cmdp = factored.joint(model)
     totals, broken = [], []
     for eta in etas:
-        whole = threat.threat(cmdp, factored.lifted(model, eta)).action
+        whole = exact.threat(cmdp, factored.lifted(model, eta)).action
         totals.append(factored.summed(factored.sub_threats(model, eta)))
         broken.append(jnp.max(whole - totals[-1]))
     least = jnp.minimum(*totals)
@@ -464,7 +464,7 @@ def theorem_3(model: factored.Factored, etas: Array, x: Array) -> Array:
         excess = thresholds.certificate(cmdp, upper, x).excess
         c = cmdp.start @ upper.min(axis=-1)[0] + x * _steps(cmdp)
         allowed = secure.secure(upper, thresholds.certified(cmdp, upper, c)).admissible
-        worst = threat.expected(cmdp, secure.worst(cmdp, allowed))
+        worst = exact.expected(cmdp, secure.worst(cmdp, allowed))
         broken += [jnp.max(excess), worst - c]
     return jnp.max(jnp.stack(broken)) / thresholds.effective_horizon(model.beta, model.horizon)
 

@@ -19,7 +19,7 @@ from rp_jax.baselines.cpo import CONSTRAINED, RECOVERY, UNCONSTRAINED, CPOConfig
 from rp_jax.baselines.policies import ACTORS
 from rp_jax.envs import jam
 from rp_jax.planning.percept import Encoded
-from rp_jax.tabular import oracle, threat
+from rp_jax.tabular import exact, oracle
 
 CONFIG = CPOConfig(rollout=ROLLOUT)
 TRACED = []
@@ -203,7 +203,7 @@ def test_recovery_reduces_the_danger():
 @pytest.mark.parametrize("seed", [0, 3])
 def test_on_a_finite_cmdp_it_keeps_the_limit_and_comes_near_the_optimum(seed):
     model = cases.random_cmdp(seed, gamma=1.0, beta=1.0)
-    least = float(threat.expected(model, threat.least_threat(model)))
+    least = float(exact.expected(model, exact.least_threat(model)))
     free = oracle.optimum(model, np.inf)
     limit = 0.6 * least + 0.4 * free.danger
     best = oracle.optimum(model, limit)

@@ -15,7 +15,7 @@ from rp_jax.baselines import pid_lagrangian
 from rp_jax.baselines.actor_critic import Batch, Recent
 from rp_jax.baselines.pid_lagrangian import Controller, PIDConfig
 from rp_jax.baselines.policies import Categorical
-from rp_jax.tabular import oracle, threat
+from rp_jax.tabular import exact, oracle
 
 CONFIG = PIDConfig(rollout=ROLLOUT, learning_rate=1e-3)
 TRACED = []
@@ -138,7 +138,7 @@ def test_a_batch_without_an_end_keeps_the_last_measure(compile_soon):
 
 def test_on_a_finite_cmdp_it_keeps_the_limit_and_comes_near_the_optimum():
     model = cases.random_cmdp(0, gamma=1.0, beta=1.0)
-    least = float(threat.expected(model, threat.least_threat(model)))
+    least = float(exact.expected(model, exact.least_threat(model)))
     limit = 0.6 * least + 0.4 * oracle.optimum(model, np.inf).danger
     best = oracle.optimum(model, limit)
     pmdp = finite.pmdp_of(model)

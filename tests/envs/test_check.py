@@ -22,7 +22,7 @@ from rp_jax.dynamics import (
 )
 from rp_jax.envs import circuit, contract, jam, patrol, point_gather
 from rp_jax.envs.check import EnvError, check_contract, check_env, inspection
-from rp_jax.envs.check.batches import Draws
+from rp_jax.envs.check.batches import RandomDraws
 from rp_jax.envs.check.comparison import told_apart
 from rp_jax.envs.check.problems import own_settings
 from rp_jax.envs.check.trial import Trial
@@ -948,7 +948,9 @@ def test_there_is_no_false_alarm_over_twenty_seeds(name):
     with own_settings():
         trial = Trial(env, make(), 0)
         for seed in range(20):
-            vars(trial.draws).update(vars(Draws(jax.random.key(seed))))  # compiles nothing again
+            vars(trial.draws).update(
+                vars(RandomDraws(jax.random.key(seed)))
+            )  # compiles nothing again
             for made in ("steps", "placed"):
                 vars(trial).pop(made, None)
             for what, check in inspection.CHECKS.items():

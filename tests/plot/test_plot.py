@@ -10,7 +10,7 @@ from matplotlib import image as images
 from matplotlib import pyplot as plt
 from PIL import Image
 
-from rp_jax.plot import curves, growth, maps, scenes, tabular
+from rp_jax.plot import curves, finite, growth, maps, scenes
 
 rng = np.random.default_rng(0)
 
@@ -218,7 +218,7 @@ def test_an_animation_of_one_step_at_any_threshold(x, tmp_path):
 def test_figures_of_finite_cmdps(tmp_path):
     plt.close("all")
     threat = rng.uniform(size=(4, 2, 3)) * [[[0, 1, 1]]]
-    tabular.lake(
+    finite.lake(
         ["SFH", "FFG"], threat, ("left", "down", "right", "up"), "title", tmp_path / "a.png"
     )
     rows = [
@@ -241,8 +241,8 @@ def test_figures_of_finite_cmdps(tmp_path):
         for v in ("one", "two")
         for c in (0.01, 0.1, 1.0)
     ]
-    tabular.budgets(rows, optima, ("eta 0", "eta*"), tmp_path / "b.png")
-    tabular.shares(rows, ("paper", "tight"), tmp_path / "c.png")
+    finite.budgets(rows, optima, ("eta 0", "eta*"), tmp_path / "b.png")
+    finite.shares(rows, ("paper", "tight"), tmp_path / "c.png")
     for name in ("a", "b", "c"):
         drawn(tmp_path / f"{name}.png")
     assert plt.get_fignums() == []

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from cases import random_cmdp
 
-from rp_jax.tabular import cmdp, threat
+from rp_jax.tabular import cmdp, exact
 
 KERNEL = np.asarray([[[0.25, 0.75], [1.0, 0.0]], [[0.0, 1.0], [0.5, 0.5]]])
 GOOD = {
@@ -125,9 +125,9 @@ def test_what_is_wrong_with_a_table_is_named(table, danger, message):
 def test_cmdps_are_solved_side_by_side():
     models = [random_cmdp(seed) for seed in range(5)]
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)
-    found = jax.jit(jax.vmap(threat.least_threat))(together)
+    found = jax.jit(jax.vmap(exact.least_threat))(together)
     for i, model in enumerate(models):
-        np.testing.assert_allclose(found.state[i], threat.least_threat(model).state, rtol=1e-12)
+        np.testing.assert_allclose(found.state[i], exact.least_threat(model).state, rtol=1e-12)
 
 
 def test_a_table_may_be_of_lists_and_its_starts_are_its_own_states():

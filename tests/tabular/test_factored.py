@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from cases import jitted
 
-from rp_jax.tabular import factored, threat, verify
+from rp_jax.tabular import exact, factored, verify
 
 drawn = jax.jit(verify.draw_factored, static_argnums=(1, 2, 3, 4))
 
@@ -42,7 +42,7 @@ def test_sums_are_taken_at_each_joint_state():
 def test_a_single_hazard_s_sum_is_its_threat():
     model, eta = drawn(jax.random.key(3), 3, 2, 1, 4)
     total = factored.summed(factored.sub_threats(model, eta))
-    whole = threat.threat(factored.sub_rmdp(model, 0), factored.lifted(model, eta)).action
+    whole = exact.threat(factored.sub_rmdp(model, 0), factored.lifted(model, eta)).action
     np.testing.assert_array_equal(total, whole)
 
 
@@ -55,7 +55,7 @@ def test_hazards_that_never_meet_add_up_exactly():
         two.replace(hits=two.hits.at[0].set(0.0)),
     ]
     model = model.replace(hazards=apart)
-    whole = threat.threat(factored.joint(model), factored.lifted(model, eta)).action
+    whole = exact.threat(factored.joint(model), factored.lifted(model, eta)).action
     total = factored.summed(factored.sub_threats(model, eta))
     np.testing.assert_allclose(whole, total, atol=1e-12)
 
@@ -80,9 +80,9 @@ def test_a_baseline_that_sees_the_obstacles_breaks_theorem_3():
     for n in range(2):
         alone = factored.sub_rmdp(model, n)
         flee = jnp.eye(2)[jnp.asarray([0, 1 - n])]  # from its hazard; else action 0
-        seen.append(threat.threat(alone, flee).action.reshape(2, 1, 2, 2))
+        seen.append(exact.threat(alone, flee).action.reshape(2, 1, 2, 2))
     total = factored.summed(seen)
-    whole = threat.least_threat(factored.joint(model)).action
+    whole = exact.least_threat(factored.joint(model)).action
     both = 3  # the state in which both hazards are there
     assert float(whole[0, both].min()) == pytest.approx(2.0)
     assert float(total[0, both].min()) == pytest.approx(1.0)
@@ -100,14 +100,14 @@ def test_algorithm_2_plans_inside_the_sum_s_sets():
     best = np.asarray(planned.policy) > 0
     chosen = np.where(best, np.asarray(total), 0).sum(-1)
     assert ((chosen <= float(x)) | (chosen == np.asarray(total).min(-1))).all()
-    done = threat.expected(cmdp, threat.threat(cmdp, planned.policy))
+    done = exact.expected(cmdp, exact.threat(cmdp, planned.policy))
     assert float(done) <= c
 
 
 def test_truncated_rollouts_need_their_margin():
     model, eta = drawn(jax.random.key(5), 3, 2, 2, 4)
     model = model.replace(beta=jnp.asarray(0.9))
-    whole = jitted(threat.threat)(factored.joint(model), factored.lifted(model, eta)).action
+    whole = jitted(exact.threat)(factored.joint(model), factored.lifted(model, eta)).action
     short = factored.sub_threats(model.replace(horizon=2), eta[:2])
     total = factored.summed(short)
     assert (whole[0] > total[0] + 1e-3).any()

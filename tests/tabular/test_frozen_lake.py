@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from cases import jitted
 
-from rp_jax.tabular import cmdp, frozen_lake, threat
+from rp_jax.tabular import cmdp, exact, frozen_lake
 
 CELLS = np.asarray([[*row] for row in frozen_lake.MAP_8X8])
 LEFT, DOWN, RIGHT, UP = range(4)
@@ -33,11 +33,11 @@ def test_holes_end_the_episode_or_hold_for_its_rest():
     for holes, expected in (("paper", 1.0), ("released", 10.0)):
         lake = frozen_lake.frozen_lake(["SH", "FG"], holes=holes, horizon=10, slip=0.0)
         into = np.eye(4)[[RIGHT] * 5]
-        assert float(threat.expected(lake, threat.threat(lake, into))) == expected
-        assert float(threat.expected(lake, threat.returns(lake, into))) == 0
+        assert float(exact.expected(lake, exact.threat(lake, into))) == expected
+        assert float(exact.expected(lake, exact.returns(lake, into))) == 0
         around = np.eye(4)[[DOWN, DOWN, RIGHT, DOWN, DOWN]]
-        assert float(threat.expected(lake, threat.threat(lake, around))) == 0
-        assert float(threat.expected(lake, threat.returns(lake, around))) == 1  # once
+        assert float(exact.expected(lake, exact.threat(lake, around))) == 0
+        assert float(exact.expected(lake, exact.returns(lake, around))) == 1  # once
 
 
 def test_a_step_slips_to_either_side_and_edges_and_walls_stop_it():
@@ -52,7 +52,7 @@ def test_a_step_slips_to_either_side_and_edges_and_walls_stop_it():
 def test_the_safe_path_is_the_paper_s():
     """Section 5.2: along the right column; at (6, 8) and (7, 8) only RIGHT is safe."""
     lake = frozen_lake.frozen_lake(holes="paper")
-    found = np.asarray(jitted(threat.least_threat)(lake).action[0])
+    found = np.asarray(jitted(exact.least_threat)(lake).action[0])
     for row in (6, 7):
         safe = np.flatnonzero(found[at(row, 8)] < 1e-12)
         assert safe.tolist() == [RIGHT]

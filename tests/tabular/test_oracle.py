@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from cases import counterexample_2, jitted, random_cmdp
 
-from rp_jax.tabular import oracle, threat
+from rp_jax.tabular import exact, oracle
 
-least_of = jitted(threat.least_threat)
+least_of = jitted(exact.least_threat)
 
 
 def dangers_and_returns(cmdp):
@@ -18,8 +18,8 @@ def dangers_and_returns(cmdp):
     policies = jax.nn.one_hot(np.reshape(choices, (-1, horizon, states)), actions)
     each = jax.vmap(
         lambda policy: (
-            threat.expected(cmdp, threat.threat(cmdp, policy)),
-            threat.expected(cmdp, threat.returns(cmdp, policy)),
+            exact.expected(cmdp, exact.threat(cmdp, policy)),
+            exact.expected(cmdp, exact.returns(cmdp, policy)),
         )
     )
     return map(np.asarray, jax.jit(each)(policies))
@@ -51,16 +51,16 @@ def test_the_program_and_the_lagrangian_curve_are_the_best_of_all_policies(gamma
 def test_the_program_s_policy_does_what_it_says(horizon):
     for seed in range(5):
         cmdp = random_cmdp(seed, horizon=horizon, gamma=0.9, beta=0.9)
-        least = float(threat.expected(cmdp, threat.least_threat(cmdp)))
+        least = float(exact.expected(cmdp, exact.least_threat(cmdp)))
         c = least + 0.2
         found = oracle.optimum(cmdp, c)
         assert found.policy.shape == cmdp.shape
         np.testing.assert_allclose(found.policy.sum(-1), 1)
         policy = jnp.asarray(found.policy)
-        assert threat.expected(cmdp, threat.threat(cmdp, policy)) == pytest.approx(
+        assert exact.expected(cmdp, exact.threat(cmdp, policy)) == pytest.approx(
             found.danger, abs=1e-7
         )
-        assert threat.expected(cmdp, threat.returns(cmdp, policy)) == pytest.approx(
+        assert exact.expected(cmdp, exact.returns(cmdp, policy)) == pytest.approx(
             found.value, abs=1e-7
         )
         assert oracle.mixed(oracle.frontier(cmdp), c) == pytest.approx(found.value, abs=1e-7)
@@ -72,7 +72,7 @@ def test_of_equally_dangerous_policies_the_best_is_the_optimum():
         cmdp = random_cmdp(seed, states=4, actions=3)
         cmdp = cmdp.replace(danger=jnp.zeros((4, 3)).at[:, :2].set(0.1).at[:, 2].set(0.7))
         vertices = oracle.frontier(cmdp)
-        least = float(threat.expected(cmdp, least_of(cmdp)))
+        least = float(exact.expected(cmdp, least_of(cmdp)))
         best = oracle.optimum(cmdp, least + 1e-9).value
         assert oracle.mixed(vertices, least) == pytest.approx(best, abs=1e-6)
         assert oracle.unmixed(vertices, least).value == pytest.approx(best, abs=1e-6)
@@ -159,5 +159,5 @@ def test_another_solver_agrees(tmp_path):
     start = model.initial_states[0]
     # The method is named `at` before version 2.
     least, best = (getattr(one, "get_value", getattr(one, "at", None))(start) for one in found)
-    assert least == pytest.approx(float(threat.least_threat(cmdp).state[0, 0]), abs=1e-4)
+    assert least == pytest.approx(float(exact.least_threat(cmdp).state[0, 0]), abs=1e-4)
     assert best == pytest.approx(oracle.optimum(cmdp, np.inf).value, abs=1e-4)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from cases import random_cmdp
 
-from rp_jax.tabular import qlearning, secure, threat
+from rp_jax.tabular import exact, qlearning, secure
 
 STEPS = 150_000
 
@@ -14,7 +14,7 @@ STEPS = 150_000
 def learned(horizon, seeds=3):
     cmdp = random_cmdp(0, states=3, actions=3, horizon=horizon, gamma=0.6, beta=0.6)
     cmdp = cmdp.replace(reward=cmdp.reward - 2)  # so that what is never tried looks best
-    found = threat.threat(cmdp, threat.uniform(cmdp)).action
+    found = exact.threat(cmdp, exact.uniform(cmdp)).action
     allowed = secure.secure(found, float(np.quantile(found, 0.45)))
     learn = jax.vmap(qlearning.learn, in_axes=(0, None, None, None))
     keys = jax.random.split(jax.random.key(1), seeds)

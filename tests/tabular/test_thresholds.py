@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from cases import S, U, counterexample_1, jitted, random_cmdp, random_policy
 
-from rp_jax.tabular import secure, threat, thresholds
+from rp_jax.tabular import exact, secure, thresholds
 from rp_jax.tabular.secure import Shield
 
 
@@ -64,16 +64,16 @@ def test_what_is_no_policy_is_an_error(policy, message):
 
 @jax.jit
 def worst_danger(cmdp, admissible):
-    return threat.expected(cmdp, secure.worst(cmdp, admissible))
+    return exact.expected(cmdp, secure.worst(cmdp, admissible))
 
 
 def danger_of(cmdp, allowed):
     return float(worst_danger(cmdp, allowed.admissible))
 
 
-threaten = jitted(threat.threat)
+threaten = jitted(exact.threat)
 plan_in = jitted(thresholds.planned, static=(3,))
-least = jitted(threat.least_threat)
+least = jitted(exact.least_threat)
 intersect = jitted(secure.secure_at_all_times)
 largest_x = jitted(thresholds.evaluated)
 
@@ -99,7 +99,7 @@ def test_threats_of_the_first_step_for_all_steps_are_unsafe_and_ours_are_not():
 
 def test_x_may_differ_by_step():
     cmdp = random_cmdp(0, horizon=3)
-    action = threaten(cmdp, threat.uniform(cmdp)).action
+    action = threaten(cmdp, exact.uniform(cmdp)).action
     x = jnp.asarray([0.0, jnp.inf, float(jnp.median(action[2]))])
     found = secure.secure(action, x)
     for t in range(3):
@@ -111,7 +111,7 @@ def test_x_may_differ_by_step():
 
 def test_a_threat_equal_to_x_is_admitted():
     cmdp = random_cmdp(1)
-    action = threaten(cmdp, threat.uniform(cmdp)).action
+    action = threaten(cmdp, exact.uniform(cmdp)).action
     for x in np.unique(np.asarray(action)):
         admitted = secure.secure(action, x)
         np.testing.assert_array_equal(
@@ -121,12 +121,12 @@ def test_a_threat_equal_to_x_is_admitted():
 
 def test_the_worst_policy_is_the_worst_of_all():
     cmdp = random_cmdp(2, states=3, actions=2, horizon=3)
-    allowed = secure.secure(threaten(cmdp, threat.uniform(cmdp)).action, 0.6).admissible
+    allowed = secure.secure(threaten(cmdp, exact.uniform(cmdp)).action, 0.6).admissible
     worst = secure.worst(cmdp, allowed)
     assert (worst.policy <= allowed).all()
     evaluated = threaten(cmdp, worst.policy)
     np.testing.assert_allclose(evaluated.state, worst.state, atol=1e-12)
-    evaluate = jitted(threat.threat)
+    evaluate = jitted(exact.threat)
     for seed in range(200):
         weights = jnp.asarray(random_policy(seed, cmdp.shape)) * allowed
         policy = weights / weights.sum(-1, keepdims=True)
@@ -135,10 +135,10 @@ def test_the_worst_policy_is_the_worst_of_all():
 
 def test_a_plan_stays_inside_and_is_the_best_there():
     cmdp = random_cmdp(3, states=3, actions=3, horizon=3)
-    allowed = secure.secure(threaten(cmdp, threat.uniform(cmdp)).action, 0.5).admissible
+    allowed = secure.secure(threaten(cmdp, exact.uniform(cmdp)).action, 0.5).admissible
     best = secure.plan(cmdp, allowed)
     assert (best.policy <= allowed).all()
-    evaluate = jitted(threat.returns)
+    evaluate = jitted(exact.returns)
     np.testing.assert_allclose(evaluate(cmdp, best.policy).state, best.state, atol=1e-12)
     for seed in range(200):
         weights = jnp.asarray(random_policy(seed, cmdp.shape)) * allowed
@@ -149,7 +149,7 @@ def test_a_plan_stays_inside_and_is_the_best_there():
 def test_value_iteration_of_the_p_mdp_by_hand():
     """Algorithm 3 as printed, swept until it stands still."""
     cmdp = random_cmdp(4, horizon=None, gamma=0.8, beta=0.8)
-    found = threat.threat(cmdp, threat.uniform(cmdp)).action
+    found = exact.threat(cmdp, exact.uniform(cmdp)).action
     allowed = secure.secure(found, float(np.median(found.min(-1))))
     assert 0 < int(allowed.secure.sum()) < allowed.secure.size
     value = np.zeros(4)
@@ -166,7 +166,7 @@ def test_value_iteration_of_the_p_mdp_by_hand():
 def test_the_evaluated_threshold_is_the_largest():
     for seed in range(5):
         cmdp = random_cmdp(seed)
-        action = threaten(cmdp, threat.uniform(cmdp)).action
+        action = threaten(cmdp, exact.uniform(cmdp)).action
         values = np.unique(np.asarray(action))
         dangers = [danger_of(cmdp, secure.secure(action, x)) for x in values]
         assert (np.diff(dangers) >= -1e-12).all()
@@ -192,14 +192,14 @@ def test_each_rule_keeps_the_bound_and_more_room_earns_no_less(rule):
     for seed in range(3):
         cmdp = random_cmdp(seed, horizon=5)
         star = least(cmdp)
-        lowest = float(threat.expected(cmdp, star))
+        lowest = float(exact.expected(cmdp, star))
         earned = []
         for c in (lowest, lowest + 0.1, lowest + 1.0, 100.0):
             chosen, planned = plan_in(cmdp, c, star.policy, thresholds.RULES[rule])
             assert danger_of(cmdp, chosen.shield) <= c + 1e-12
-            earned.append(float(threat.expected(cmdp, planned)))
+            earned.append(float(exact.expected(cmdp, planned)))
         assert rule not in NESTED or (np.diff(earned) >= -1e-12).all()
-        free = threat.expected(cmdp, secure.plan(cmdp, jnp.ones(cmdp.shape, bool)))
+        free = exact.expected(cmdp, secure.plan(cmdp, jnp.ones(cmdp.shape, bool)))
         assert earned[-1] == pytest.approx(float(free))
 
 
@@ -208,12 +208,12 @@ def test_rules_from_the_strictest_to_the_freest():
     for seed in range(20):
         cmdp = random_cmdp(seed, horizon=5)
         star = least(cmdp)
-        c = float(threat.expected(cmdp, star)) + 0.3
+        c = float(exact.expected(cmdp, star)) + 0.3
         found = {}
         for name in ("paper", "tight", "per step", "evaluated"):
             rule = thresholds.RULES[name]
             chosen, planned = plan_in(cmdp, c, star.policy, rule)
-            found[name] = float(threat.expected(cmdp, planned)), chosen
+            found[name] = float(exact.expected(cmdp, planned)), chosen
         earned = [found[name][0] for name in ("tight", "per step", "evaluated")]
         assert (np.diff(earned) >= -1e-12).all()
         assert float(found["tight"][1].x) == pytest.approx(2 * float(found["paper"][1].x))
@@ -238,10 +238,10 @@ def test_factor_1_cannot_be_beaten():
 def test_a_certificate_needs_no_policy():
     """U with margin: m bounds the danger of the greedy policy, whatever U came from."""
     cmdp = random_cmdp(5, horizon=4)
-    upper = threaten(cmdp, threat.uniform(cmdp)).action + 0.05
+    upper = threaten(cmdp, exact.uniform(cmdp)).action + 0.05
     proved = thresholds.certificate(cmdp, upper, 0.0)
     assert (proved.excess <= 1e-12).all()
-    greedy = threaten(cmdp, threat.greedy(upper)).state
+    greedy = threaten(cmdp, exact.greedy(upper)).state
     assert (greedy <= proved.least + 1e-12).all()
     np.testing.assert_allclose(proved.state, proved.least, atol=1e-12)
     c = 3.0

@@ -18,11 +18,11 @@ from experiments import theorems
 from rp_jax import shield
 from rp_jax.tabular import (
     cmdp,
+    exact,
     factored,
     frozen_lake,
     qlearning,
     secure,
-    threat,
     thresholds,
     verify,
 )
@@ -63,7 +63,7 @@ def test_the_instances_cover_what_they_should():
     absorbing = (np.asarray(cases.cmdp.transition)[:, range(4), :, range(4)] == 1).all(-1)
     assert 0.1 < absorbing.mean() < 0.4
     assert (np.asarray(cases.eta) == 0).mean() > 0.1
-    action = jax.vmap(threat.threat)(cases.cmdp, cases.eta).action
+    action = jax.vmap(exact.threat)(cases.cmdp, cases.eta).action
     first = np.asarray(cases.x)[:, 0]
     gap = np.abs(np.asarray(action) - first[:, None, None, None]).min(axis=(1, 2, 3))
     assert (gap < 1e-15).mean() > 0.2
@@ -136,7 +136,7 @@ def test_threats_of_the_first_step_for_all_steps_are_caught(monkeypatch):
     broken = violated(cmdps, 3)
     assert broken["corollary 2"] > 5
     model, eta = counterexample_1()
-    allowed = secure.secure(threat.threat(model, eta).action, 0.01)
+    allowed = secure.secure(exact.threat(model, eta).action, 0.01)
     assert allowed.admissible[1, U, 0]
     reached = secure.worst(model, allowed.admissible).state[0, S]
     assert float(reached) == pytest.approx(1.01)
@@ -154,13 +154,13 @@ def test_one_step_too_few_in_the_effective_horizon_is_caught(monkeypatch):
     assert broken["certificate"] > 10
 
 
-def late(cmdp, policy, right=threat.threat):
+def late(cmdp, policy, right=exact.threat):
     found = right(cmdp, policy)
     return found._replace(action=cmdp.beta * found.action, state=cmdp.beta * found.state)
 
 
 def test_one_power_of_beta_too_many_is_caught(monkeypatch):
-    for module in (threat, thresholds):
+    for module in (exact, thresholds):
         monkeypatch.setattr(module, "threat", late)
     broken = violated(cmdps, 3)
     assert broken["theorem 1"] > 10

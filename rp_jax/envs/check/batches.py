@@ -111,7 +111,7 @@ def flat(tree: Any) -> np.ndarray:
     return np.concatenate([a.reshape(len(a), -1).astype(float) for a in leaves], axis=1)
 
 
-class Draws:
+class RandomDraws:
     """Random numbers on the host, from one key; each call gives other ones."""
 
     def __init__(self, key: Any) -> None:

@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 from jax import Array
 
-from rp_jax.envs.check.batches import Batched, Draws, typed
+from rp_jax.envs.check.batches import Batched, RandomDraws, typed
 from rp_jax.hazards import is_static
 
 
 class Pairs:
     """The functions of one kind of hazard, compiled for batches of (body, hazard) pairs."""
 
-    def __init__(self, env: Any, params: Any, kind: str, draws: Draws) -> None:
+    def __init__(self, env: Any, params: Any, kind: str, draws: RandomDraws) -> None:
         """Prepares the functions; each is compiled when it is first called.
 
         Args:

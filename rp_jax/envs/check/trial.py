@@ -15,7 +15,7 @@ from rp_jax.envs import autoreset, optional
 from rp_jax.envs.check.batches import (
     BATCH,
     Batched,
-    Draws,
+    RandomDraws,
     frozen,
     is_key,
     join,
@@ -70,7 +70,7 @@ class Trial:
         """
         self.env, self.params = env, params
         key = jax.random.key(seed)
-        self.draws = Draws(key)
+        self.draws = RandomDraws(key)
         self.num_actions = int(optional.num_actions(env, params))
         self.limit = int(params.time_limit)
         self.model = params.body

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from cases import counterexample_2, jitted, random_cmdp, random_policy
 
-from rp_jax.tabular import threat
+from rp_jax.tabular import exact
 
-evaluate = jitted(threat.threat)
-least = jitted(threat.least_threat)
-iterate = jitted(threat.policy_iteration, static=(2,))
+evaluate = jitted(exact.threat)
+least = jitted(exact.least_threat)
+iterate = jitted(exact.policy_iteration, static=(2,))
 
 
 def by_trajectories(cmdp, policy, t, state, action):
@@ -39,7 +39,7 @@ def test_threats_are_expected_discounted_dangers(beta):
         expected = by_trajectories(cmdp, policy, t, state, action)
         assert found.action[t, state, action] == pytest.approx(expected, abs=1e-12)
     np.testing.assert_allclose(found.state, (policy * found.action).sum(-1), atol=1e-14)
-    assert threat.expected(cmdp, found) == pytest.approx(cmdp.start @ found.state[0])
+    assert exact.expected(cmdp, found) == pytest.approx(cmdp.start @ found.state[0])
 
 
 def test_a_stationary_policy_is_the_same_at_all_steps():
@@ -55,7 +55,7 @@ def test_returns_are_threats_of_the_reward():
     policy = jnp.asarray(random_policy(5, cmdp.danger.shape))
     swapped = cmdp.replace(danger=cmdp.reward, beta=cmdp.gamma)
     np.testing.assert_array_equal(
-        jitted(threat.returns)(cmdp, policy).state, evaluate(swapped, policy).state
+        jitted(exact.returns)(cmdp, policy).state, evaluate(swapped, policy).state
     )
 
 
@@ -84,7 +84,7 @@ def test_the_least_threat_is_that_of_the_best_of_all_policies(horizon):
     best = least(cmdp)
     choices = list(itertools.product(range(2), repeat=horizon * 3))
     policies = jax.nn.one_hot(np.reshape(choices, (-1, horizon, 3)), 2)
-    every = jax.jit(jax.vmap(threat.threat, in_axes=(None, 0)))(cmdp, policies)
+    every = jax.jit(jax.vmap(exact.threat, in_axes=(None, 0)))(cmdp, policies)
     np.testing.assert_allclose(best.state, every.state.min(axis=0), atol=1e-12)
     again = evaluate(cmdp, best.policy)
     np.testing.assert_allclose(again.state, best.state, atol=1e-12)
@@ -93,10 +93,10 @@ def test_the_least_threat_is_that_of_the_best_of_all_policies(horizon):
 def test_only_time_indexed_policies_reach_the_least_threat():
     cmdp = counterexample_2()
     found = least(cmdp)
-    assert threat.expected(cmdp, found) == pytest.approx(0.4)
+    assert exact.expected(cmdp, found) == pytest.approx(0.4)
     np.testing.assert_array_equal(found.policy[:, 0], [[1, 0], [0, 1]])
     stay = [
-        float(threat.expected(cmdp, evaluate(cmdp, jnp.asarray([[p, 1 - p], [1.0, 0.0]]))))
+        float(exact.expected(cmdp, evaluate(cmdp, jnp.asarray([[p, 1 - p], [1.0, 0.0]]))))
         for p in (0.0, 1.0, 0.75)
     ]
     assert stay == pytest.approx([1.0, 0.8, 0.775])
@@ -105,7 +105,7 @@ def test_only_time_indexed_policies_reach_the_least_threat():
 def test_policy_iteration_never_makes_it_worse_and_arrives():
     for seed in range(10):
         cmdp = random_cmdp(seed, horizon=5)
-        steps = iterate(cmdp, threat.uniform(cmdp), 6)
+        steps = iterate(cmdp, exact.uniform(cmdp), 6)
         assert len(steps) == 7
         np.testing.assert_allclose(steps[0], 1 / 3)
         dangers = [np.asarray(evaluate(cmdp, eta).state) for eta in steps]
@@ -116,6 +116,6 @@ def test_policy_iteration_never_makes_it_worse_and_arrives():
 
 def test_ties_go_to_the_first_action():
     np.testing.assert_array_equal(
-        threat.greedy(jnp.asarray([[[0.5, 0.2, 0.2]], [[1.0, 1.0, 1.0]]])),
+        exact.greedy(jnp.asarray([[[0.5, 0.2, 0.2]], [[1.0, 1.0, 1.0]]])),
         [[[0, 1, 0]], [[1, 0, 0]]],
     )
