@@ -33,6 +33,7 @@ class Config(TrainConfig):
 
 def make_world(config: Any) -> World:
     """The road with so many pedestrians."""
+    shields.check(config)
     tests = {f"{n} pedestrians": {"pedestrians": n} for n in config.test_pedestrians}
     return World("crossing", world, {"pedestrians": config.pedestrians}, tests)
 

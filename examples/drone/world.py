@@ -30,12 +30,12 @@ class Brake(struct.PyTreeNode):
     """Brakes to a halt and stays there; a `rp_jax.dynamics.BaselinePolicy`."""
 
     def draw(self, key: Array, shape: tuple[int, ...] = ()) -> Array:
-        """Returns zeros: nothing is random."""
-        return jnp.zeros(shape)
+        """Returns how strong the brakes are, which varies."""
+        return jax.random.uniform(key, shape, float, 0.7 * ACCELERATION, ACCELERATION)
 
     def act(self, body: Motion, noise: Array) -> Array:
         """Returns the acceleration (2,) against the velocity, not beyond a halt."""
-        return jnp.clip(-body.velocity, -ACCELERATION, ACCELERATION)
+        return jnp.clip(-body.velocity, -noise, noise)
 
 
 class Drone(struct.PyTreeNode):
@@ -60,7 +60,7 @@ class Obstacle(struct.PyTreeNode):
     top_speed: Array | float = 0.0
     jitter: Array | float = 0.0  # greatest change of its velocity in a step
     axes: tuple[int, int] = struct.field(pytree_node=False, default=(1, 1))  # (0, 1): a wall
-    horizon: int = struct.field(pytree_node=False, default=5)  # the drone brakes in 4 steps
+    horizon: int = struct.field(pytree_node=False, default=8)  # longer than it brakes
 
     def draw(self, key: Array, shape: tuple[int, ...] = ()) -> Array:
         """Returns changes of velocity (..., 2)."""
@@ -126,8 +126,8 @@ def make_params(discs: int = 10, *, time_limit: int = 100) -> Params:
     number("discs", discs, least=SEEN, most=100, integer=True)
     number("time_limit", time_limit, least=1, most=10**9, integer=True)
     table = ACCELERATION * jnp.asarray([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
-    disc, wall = Obstacle(0.12, 0.02, 0.002, horizon=8), Obstacle(0.1, axes=(0, 1))
-    sources = {"disc": disc, "pylon": Obstacle(0.1), "wall": wall}
+    wall = Obstacle(0.1, axes=(0, 1))
+    sources = {"disc": Obstacle(0.12, 0.02, 0.002), "pylon": Obstacle(0.1), "wall": wall}
     return Params(Drone(table, Brake()), sources, jnp.asarray(time_limit, jnp.int32), discs)
 
 

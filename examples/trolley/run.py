@@ -38,6 +38,7 @@ class Config(TrainConfig):
 
 def make_world(config: Any) -> World:
     """The floor with so many carts."""
+    shields.check(config)
     tests = {f"{n} carts": {"carts": n} for n in config.test_carts}
     return World("trolley", world, {"carts": config.carts}, tests)
 

@@ -257,4 +257,4 @@ def time_agents(key: Array, agents: Agents) -> float:
     pmdp = with_member(agents.pmdp, agents.members[0])
     first = jax.tree.map(lambda a: a[0], agents.weights)
     act = acting(pmdp, greedily(agents.network), first)
-    return timed(key_of(key, Stream.EVALUATION), pmdp.env, pmdp.params, act).wall
+    return timed(key_of(key, Stream.TIMING), pmdp.env, pmdp.params, act).wall

@@ -60,17 +60,29 @@ def _batch(rows: np.ndarray, start: int) -> np.ndarray:
 
 
 def is_key(leaf: Any) -> bool:
-    """Returns whether a leaf is a typed random key."""
+    """Returns whether a leaf is a typed random key.
+
+    Args:
+        leaf: of a pytree.
+    """
     return hasattr(leaf, "dtype") and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def typed(data: Any) -> jax.Array:
-    """Returns random keys (...) from their data."""
+    """Returns random keys (...) from their data.
+
+    Args:
+        data: (..., n) words of the keys.
+    """
     return jax.random.wrap_key_data(jnp.asarray(data))
 
 
 def frozen(tree: Any) -> Any:
-    """Returns a pytree in which typed random keys are replaced by their data."""
+    """Returns a pytree in which typed random keys are replaced by their data.
+
+    Args:
+        tree: any pytree.
+    """
     return jax.tree.map(lambda a: jax.random.key_data(a) if is_key(a) else a, tree)
 
 
@@ -91,22 +103,40 @@ def thawed(tree: Any, example: Any) -> Any:
 
 
 def take(tree: Any, index: Any) -> Any:
-    """Returns rows of a pytree of NumPy arrays."""
+    """Returns rows of a pytree of NumPy arrays.
+
+    Args:
+        tree: leading axis (n,).
+        index: which rows; whatever NumPy takes.
+    """
     return jax.tree.map(lambda a: a[index], tree)
 
 
 def join(*trees: Any) -> Any:
-    """Returns pytrees of NumPy arrays one after another along the leading axis."""
+    """Returns pytrees of NumPy arrays one after another along the leading axis.
+
+    Args:
+        *trees: pytrees of the same structure.
+    """
     return jax.tree.map(lambda *parts: np.concatenate(parts), *trees)
 
 
 def repeat(tree: Any, times: int) -> Any:
-    """Returns each row of a pytree of NumPy arrays so many times, one copy after another."""
+    """Returns each row of a pytree of NumPy arrays so many times, one copy after another.
+
+    Args:
+        tree: leading axis (n,).
+        times: how often.
+    """
     return jax.tree.map(lambda a: np.repeat(a, times, axis=0), tree)
 
 
 def flat(tree: Any) -> np.ndarray:
-    """Returns the leaves of a pytree of NumPy arrays side by side, (n, D) floats."""
+    """Returns the leaves of a pytree of NumPy arrays side by side, (n, D) floats.
+
+    Args:
+        tree: leading axis (n,).
+    """
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
     return np.concatenate([a.reshape(len(a), -1).astype(float) for a in leaves], axis=1)
 
@@ -128,19 +158,37 @@ class RandomDraws:
         return np.concatenate(blocks)[:count]
 
     def keys(self, count: int) -> np.ndarray:
-        """Returns the data of random keys (count, ...)."""
+        """Returns the data of random keys (count, ...).
+
+        Args:
+            count: how many.
+        """
         return self._blocks(self._split, count)
 
     def uniform(self, count: int) -> np.ndarray:
-        """Returns numbers (count,) in [0, 1)."""
+        """Returns numbers (count,) in [0, 1).
+
+        Args:
+            count: how many.
+        """
         return self._blocks(self._draw, count).astype(float)
 
     def integers(self, count: int, most: int) -> np.ndarray:
-        """Returns int32 numbers (count,) below `most`."""
+        """Returns int32 numbers (count,) below `most`.
+
+        Args:
+            count: how many.
+            most: all are less than this.
+        """
         return np.minimum(self.uniform(count) * most, most - 1).astype(np.int32)
 
     def among(self, rows: Any, count: int) -> np.ndarray:
-        """Returns so many of some indices (n,); each at most once, or all of them in turn."""
+        """Returns so many of some indices (n,); each at most once, or all of them in turn.
+
+        Args:
+            rows: (n,) indices.
+            count: how many.
+        """
         rows = np.asarray(rows)
         if len(rows) > count:
             return rows[np.argsort(self.uniform(len(rows)))[:count]]

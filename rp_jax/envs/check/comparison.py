@@ -49,7 +49,13 @@ def tolerance_of(features: np.ndarray, *pairs: Any, loose: float = 1e-4) -> np.n
 
 
 def beyond(a: np.ndarray, b: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
-    """Returns which rows of features (n, F) differ by more than a tolerance (F,), (n,) bool."""
+    """Returns which rows of features (n, F) differ by more than a tolerance (F,), (n,) bool.
+
+    Args:
+        a: features of one kind.
+        b: features to compare them with.
+        tolerance: greatest difference of each.
+    """
     return ~(np.abs(a - b) <= tolerance).all(axis=1)
 
 

@@ -1,4 +1,4 @@
-"""What a step has to do with the hazards of each kind."""
+"""Hits and reach of the hazards of each kind, before and after a step."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from rp_jax.hazards import is_static
 
 
 class Contact(struct.PyTreeNode):
-    """What one step had to do with the hazards of one kind, () bool each."""
+    """Hits and reach of the hazards of one kind in one step, () bool each."""
 
     hit: Array  # a hazard that is present afterwards is hit
     hit_before: Array  # a static one that was present before the step is hit

@@ -46,25 +46,53 @@ class Pairs:
         self._mirror = Batched(lambda params, row: sub(params).source.mirrored(row))
 
     def look(self, bodies: Any, hazards: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns (features (n, F), hits (n,), in_reach (n,)) of pairs (n, ...)."""
+        """Returns (features (n, F), hits (n,), in_reach (n,)) of pairs (n, ...).
+
+        Args:
+            bodies: states, leading axis (n,).
+            hazards: states, leading axis (n,).
+        """
         return self._look(self.params, bodies, hazards)
 
     def features(self, bodies: Any, hazards: Any) -> np.ndarray:
-        """Returns the features (n, F) of pairs (n, ...)."""
+        """Returns the features (n, F) of pairs (n, ...).
+
+        Args:
+            bodies: states, leading axis (n,).
+            hazards: states, leading axis (n,).
+        """
         return self.look(bodies, hazards)[0]
 
     def drift(self, keys: np.ndarray, hazards: Any, bodies: Any) -> Any:
-        """Returns where the source takes hazards (n, ...) in a step, with a random key each."""
+        """Returns where the source takes hazards (n, ...) in a step, with a random key each.
+
+        Args:
+            keys: (n, ...) data of random keys.
+            hazards: states, leading axis (n,).
+            bodies: states, leading axis (n,).
+        """
         return self._drift(self.params, keys, hazards, bodies)
 
     def sample(self, count: int) -> tuple[Any, Any]:
-        """Returns so many (body, hazard) pairs that the source draws."""
+        """Returns so many (body, hazard) pairs that the source draws.
+
+        Args:
+            count: how many.
+        """
         return self._sample(self.params, self.draws.keys(count))
 
     def restore(self, features: np.ndarray) -> tuple[Any, Any]:
-        """Returns pairs (n, ...) that `state_of` makes of features (n, F)."""
+        """Returns pairs (n, ...) that `state_of` makes of features (n, F).
+
+        Args:
+            features: of the pairs.
+        """
         return self._restore(self.params, features)
 
     def mirror(self, features: np.ndarray) -> np.ndarray:
-        """Returns the mirrored features (n, F)."""
+        """Returns the mirrored features (n, F).
+
+        Args:
+            features: to be mirrored.
+        """
         return self._mirror(self.params, features)

@@ -44,18 +44,32 @@ def attempted(what: str, check: Callable[[], list[str]]) -> list[str]:
 
 
 def trouble(error: Exception) -> str:
-    """Returns the type and the first line of an exception's message."""
+    """Returns the type and the first line of an exception's message.
+
+    Args:
+        error: the exception.
+    """
     lines = str(error).strip().splitlines() or ["without a message"]
     return f"{type(error).__name__}: {lines[0][:300]}"
 
 
 def number_of(part: int, whole: int, things: str) -> str:
-    """Returns a text such as "3 of 1,000 steps"."""
+    """Returns a text such as "3 of 1,000 steps".
+
+    Args:
+        part: how many of them.
+        whole: how many there are.
+        things: their name, in the plural.
+    """
     return f"{part:,} of {whole:,} {things}"
 
 
 def value_of(array: Any) -> str:
-    """Returns a short text of the values of an array or a pytree of arrays."""
+    """Returns a short text of the values of an array or a pytree of arrays.
+
+    Args:
+        array: an array, or a pytree of arrays.
+    """
     values = np.concatenate([np.ravel(np.asarray(leaf)) for leaf in jax.tree.leaves(array)])
     few = ", ".join(f"{value:.6g}" for value in values[:8].astype(float))
     text = few if len(values) <= 8 else f"{few}, ..."
@@ -63,21 +77,34 @@ def value_of(array: Any) -> str:
 
 
 def plain(value: Any) -> str:
-    """Returns what a sentence says of a setting: a number with its type, or as it is shown."""
+    """Returns what a sentence says of a setting: a number with its type, or as it is shown.
+
+    Args:
+        value: of the setting.
+    """
     if isinstance(value, jax.Array | np.ndarray | np.generic) and value.ndim == 0:
         return f"{value:.6g} ({value.dtype})"
     return shown(value)
 
 
 def described(leaf: Any) -> str:
-    """Returns the type and the shape of a leaf, such as "float32[3, 2]"."""
+    """Returns the type and the shape of a leaf, such as "float32[3, 2]".
+
+    Args:
+        leaf: an array, or anything else.
+    """
     if hasattr(leaf, "shape") and hasattr(leaf, "dtype"):
         return f"{leaf.dtype}{list(leaf.shape)}"
     return shown(leaf)
 
 
 def same_structure(one: Any, other: Any) -> bool:
-    """Returns whether two pytrees have the same structure."""
+    """Returns whether two pytrees have the same structure.
+
+    Args:
+        one: a pytree.
+        other: another.
+    """
     return str(jax.tree.structure(one)) == str(jax.tree.structure(other))
 
 

@@ -67,7 +67,11 @@ def with_leading(shape: tuple[int, ...], tree: Any) -> Any:
 
 
 def first_row(tree: Any) -> Any:
-    """Returns the shapes of a pytree without the leading axis."""
+    """Returns the shapes of a pytree without the leading axis.
+
+    Args:
+        tree: of shapes, leading axis (n,).
+    """
     return jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), tree)
 
 

@@ -49,7 +49,12 @@ class Steps(struct.PyTreeNode):
 
 
 def replaced(tree: Any, **fields: Any) -> Any:
-    """Returns a state with other values of some fields."""
+    """Returns a state with other values of some fields.
+
+    Args:
+        tree: the state, a dataclass or a named tuple.
+        **fields: the values, by name.
+    """
     if hasattr(tree, "replace"):
         return tree.replace(**fields)
     if hasattr(tree, "_replace"):
@@ -88,7 +93,11 @@ class Trial:
         self._advance = Batched(self._look, whole=True)
 
     def thaw(self, state: Any) -> Any:
-        """Returns a state with typed random keys in place of their data."""
+        """Returns a state with typed random keys in place of their data.
+
+        Args:
+            state: with the data of its keys.
+        """
         return thawed(state, self._example)
 
     def _moving(self, params: Any, state: Any) -> dict[str, Any]:
@@ -97,7 +106,11 @@ class Trial:
         return {kind: group for kind, group in groups.items() if not self.pairs[kind].static}
 
     def at_most(self, rows: int) -> int:
-        """Returns how many of some rows of states fit into the memory, at least 1."""
+        """Returns how many of some rows of states fit into the memory, at least 1.
+
+        Args:
+            rows: how many are wanted.
+        """
         leaves = jax.tree.leaves(jax.eval_shape(frozen, self._example))
         size = sum(leaf.dtype.itemsize * leaf.size for leaf in leaves)
         return int(np.clip(MEMORY / max(size, 1), 1, rows))
@@ -134,7 +147,12 @@ class Trial:
         )
 
     def advance(self, states: Any, actions: np.ndarray) -> Steps:
-        """Makes a step from each state (n, ...) under an action each (n,)."""
+        """Makes a step from each state (n, ...) under an action each (n,).
+
+        Args:
+            states: leading axis (n,).
+            actions: (n,) indices.
+        """
         return self._advance(self.params, self.draws.keys(len(actions)), states, actions)
 
     def away(self, bodies: Any, actions: Any, k: int = -1, choice: Any = None) -> Any:
