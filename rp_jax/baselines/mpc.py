@@ -16,6 +16,7 @@ from jax import Array
 
 from rp_jax.envs import optional
 from rp_jax.envs.contract import Env
+from rp_jax.hazards import is_static
 from rp_jax.planning.percept import Percept
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import number
@@ -125,7 +126,7 @@ def root(state: Any, search: Search) -> Node:
             weight=group.present[:, None].astype(zero.dtype),
         )
         for kind, group in model.hazards(state, search.params).items()
-        if not subs[kind].source.static  # the environment's own step includes the static ones
+        if not is_static(subs[kind].source)  # the environment's own step includes the static ones
     }
     return Node(model.without_moving_hazards(state), movers, zero, zero, jnp.zeros((), bool))
 

@@ -54,7 +54,7 @@ class HazardSource(Protocol):
         """
 
     def in_reach(self, body: Any, hazard: Any) -> Array:
-        """Returns whether the hazard may be hit within `horizon` steps, () bool.
+        """Returns whether the hazard may be hit within `horizon` steps under any actions, () bool.
 
         Where it is False, the threat is taken to be 0.
 
@@ -66,7 +66,8 @@ class HazardSource(Protocol):
     def features(self, body: Any, hazard: Any) -> Array:
         """Returns what a threat model sees of a body and a hazard, (F,) floats.
 
-        Positions are in the body's frame, the hazard's relative position first.
+        Positions are in the body's frame, or along the world's axes where a body has no heading;
+        the hazard's relative position comes first.
 
         Args:
             body: the body's state.

@@ -227,10 +227,10 @@ def test_bad_batches_of_actions_are_refused(action, message):
 
 def test_other_bad_input_is_refused():
     with pytest.raises(ValueError, match=r"^name is 'jem'"):
-        adapter.Env("jem")
+        adapter.JaxEnv("jem")
     with pytest.raises(ValueError, match=r"^num_envs is 0"):
         adapter.JaxVectorEnv("jam", 0)
-    for env in (adapter.Env("circuit"), adapter.JaxVectorEnv("circuit", 2)):
+    for env in (adapter.JaxEnv("circuit"), adapter.JaxVectorEnv("circuit", 2)):
         with pytest.raises(gymnasium.error.ResetNeeded, match="before reset"):
             env.step(np.zeros(getattr(env, "num_envs", ()), int))
 
