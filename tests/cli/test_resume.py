@@ -114,11 +114,12 @@ def test_a_run_stopped_by_nan_goes_on_to_the_same_bits(tmp_path, monkeypatch, ca
 
 
 def test_a_termination_ends_a_run_as_an_interruption(begun, capsys):
+    before = signal.getsignal(signal.SIGTERM)
     again = errors.resumable("killed", begun, lambda: pytest.fail("it was not finished"))
     with pytest.raises(SystemExit, match="130"), again:
         os.kill(os.getpid(), signal.SIGTERM)
     assert "to go on: killed" in " ".join(capsys.readouterr().out.split())
-    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_a_run_of_another_world_is_refused(begun, capsys):
