@@ -189,9 +189,10 @@ def leaves(tree: Any) -> dict[str, np.ndarray]:
     """Returns the arrays of a pytree by their paths.
 
     Args:
-        tree: any pytree of arrays and random keys; a key is represented by its data.
+        tree: any pytree of arrays, numbers and random keys; a key is represented by its data.
     """
-    return {name: np.asarray(a, order="C") for name, a in _flat(jax.tree.map(_data, tree)).items()}
+    flat = _flat(jax.tree.map(_data, tree))
+    return {name: np.asarray(_array(a), order="C") for name, a in flat.items()}
 
 
 def statics(part: Any, path: str = "") -> dict[str, Any]:
@@ -230,12 +231,16 @@ def _data(a: Any) -> Any:
     return jax.random.key_data(a) if _is_key(a) else a
 
 
+def _array(a: Any) -> Any:
+    """Returns a plain number as the array that JAX takes it for, and any other leaf unchanged."""
+    return a if hasattr(a, "dtype") else np.asarray(jax.numpy.asarray(a))
+
+
 def _facts(array: Any) -> dict[str, Any]:
     """Returns shape and type of an array, or of a stand-in such as `jax.ShapeDtypeStruct`."""
     if _is_key(array):
         array = jax.eval_shape(jax.random.key_data, array)
-    if not hasattr(array, "dtype"):
-        array = np.asarray(array)
+    array = _array(array)
     return {"shape": list(array.shape), "dtype": str(array.dtype)}
 
 

@@ -476,3 +476,17 @@ def test_a_file_system_without_locks_is_worked_on_without_them(tmp_path, monkeyp
     monkeypatch.setattr(storage.fcntl, "flock", fail)
     with storage.locked(tmp_path, "lock"):
         pass
+
+
+def test_plain_numbers_are_kept_as_jax_takes_them(tmp_path):
+    plain, arrays = {"a": 0.1, "n": 3, "yes": True}, {"a": 0.0, "n": 0, "yes": False}
+    arrays = jax.tree.map(jnp.asarray, arrays)
+    for saved in (plain, jax.tree.map(jnp.asarray, plain)):
+        storage.save(tmp_path, "thing", saved, {})
+        for like in (plain, arrays):
+            found = storage.load(tmp_path, "thing", like)
+            assert {name: a.dtype for name, a in found.items()} == {
+                name: a.dtype for name, a in arrays.items()
+            }
+            np.testing.assert_array_equal(found["a"], jnp.asarray(0.1))
+    assert storage.leaves(plain)["a"].dtype == jnp.asarray(0.1).dtype

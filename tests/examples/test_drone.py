@@ -9,6 +9,8 @@ from quick import compile_soon  # noqa: F401
 from examples.drone import world
 from examples.drone.world import Motion
 from rp_jax.envs import check, optional
+from rp_jax.threat.function import ThreatFunction, load_threat
+from rp_jax.threat.model import ThreatModel, ThreatNetwork
 
 KINDS = ["disc", "pylon", "wall"]
 PAIRS = 4096
@@ -366,3 +368,17 @@ def test_numbers_out_of_range_are_refused(settings, message):
 
 def test_the_world_keeps_the_contract():
     check.check_env(world, world.make_params(4))
+
+
+def test_threats_of_a_world_with_plain_numbers_are_saved_and_found_again(tmp_path):
+    """The radius of an obstacle is a Python float; models that went through jit hold arrays."""
+    subs, models = world.sub_rmdps(params()), {}
+    network = ThreatNetwork((8,), 9)
+    weights = network.init(jax.random.key(0), jnp.zeros(6))
+    for kind, sub in subs.items():
+        source = jax.tree.map(jnp.asarray, sub.source)
+        models[kind] = ThreatModel(source, weights, jnp.ones(6), jnp.asarray(0.0), network)
+    ThreatFunction(models, dict(subs)).save(tmp_path, "examples.drone.world")
+    found = load_threat(tmp_path, world.sub_rmdps(world.make_params(discs=20)))
+    assert list(found.models) == KINDS
+    found.fits(subs)
