@@ -15,7 +15,7 @@ FOREIGN = ("brax", "matplotlib", "gymnasium")
 
 def linted(folder):
     """(whether all contracts of pyproject.toml are kept, what is said) of the library there."""
-    command = [Path(sys.executable).with_name("lint-imports"), "--no-cache", "--no-logo"]
+    command = [Path(sys.executable).with_name("lint-imports"), "--no-cache"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=folder, check=False)
     return done.returncode == 0, done.stdout + done.stderr
 
