@@ -112,11 +112,16 @@ def test_a_run_stopped_by_nan_goes_on_to_the_same_bits(tmp_path, monkeypatch, ca
     assert not (folder / "checkpoints").exists()
 
 
-def test_a_termination_ends_a_run_as_an_interruption(begun, capsys):
-    before = signal.getsignal(signal.SIGTERM)
+@pytest.mark.parametrize("ctrl_c", [signal.default_int_handler, signal.SIG_IGN])
+def test_a_termination_ends_a_run_as_an_interruption(ctrl_c, begun, capsys):
+    """Also where Ctrl-C is ignored: shells start background jobs so."""
+    before, usual = signal.getsignal(signal.SIGTERM), signal.signal(signal.SIGINT, ctrl_c)
     again = errors.resumable("killed", begun, lambda: pytest.fail("it was not finished"))
-    with pytest.raises(SystemExit, match="130"), again:
-        signal.raise_signal(signal.SIGTERM)  # to this thread: others may be there
+    try:
+        with pytest.raises(SystemExit, match="130"), again:
+            signal.raise_signal(signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGINT, usual)
     assert "to go on: killed" in " ".join(capsys.readouterr().out.split())
     assert signal.getsignal(signal.SIGTERM) == before
 
