@@ -51,8 +51,8 @@ class Env(Protocol):
         collisions(state, params)     by kind, () bool, whether a hazard is being hit; by default
                                       whether one of `hazards` is, as its source says
         clearance(position, params)   () distance left between `position` (2,) and the nearest fixed
-                                      hazard, or a lower bound of it. With it plans take all fixed
-                                      hazards together; by default there are no fixed hazards
+                                      hazard, or a lower bound of it. With it `Plans` take all fixed
+                                      hazards together, and a world under `Plans` has to have it
         threshold(state)              () greatest admissible threat in the state; by default the
                                       P-MDP's x
         LIDAR_BINS                    how many of an observation's first values are distances of a
