@@ -102,8 +102,8 @@ def settings_from(argv: Sequence[str]) -> tuple[World | None, TrainConfig, list[
             return None, TrainConfig(), ["--help"]
         else:
             world, rest = world_from(argv)
-        return world, config_of(world), rest
-    raise AssertionError  # bad input has ended the program
+        config = config_of(world)
+    return world, config, rest
 
 
 def main(argv: Sequence[str]) -> None:
