@@ -55,8 +55,8 @@ def make_world(config: Any) -> World:
 
     def settings(bombs: int) -> dict[str, Any]:
         return {
-            "n_apples": config.apples,
-            "n_bombs": bombs,
+            "num_apples": config.apples,
+            "num_bombs": bombs,
             "horizon": config.horizon,
             "fidelity": config.fidelity,
         }

@@ -97,7 +97,7 @@ def run(config: Config) -> list[dict[str, Any]]:
                             test_states=10,
                             fit=fit,
                         )
-                        built = build.build(jax.random.key(repeat), sub, settings, x)
+                        built = build.learn_threat(jax.random.key(repeat), sub, settings, x)
                         for test, (features, true) in tests.items():
                             said = np.asarray(report.predict(built.model, features))
                             rows.append(

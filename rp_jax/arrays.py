@@ -57,7 +57,7 @@ def compact_indices(where: Array, chunk: int, spare: int) -> tuple[Array, Array]
     return order, rank[-1]
 
 
-def renew(where: Array, rows: Any, make: Callable[[Array], Any], chunk: int = 16) -> Any:
+def replace_rows(where: Array, rows: Any, make: Callable[[Array], Any], chunk: int = 16) -> Any:
     """Replaces the marked rows of a batch, and computes only those.
 
     Args:

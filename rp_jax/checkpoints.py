@@ -20,7 +20,7 @@ INTERVAL = 60.0  # seconds between two checkpoints of a loop, at least
 SHARE = 0.01  # greatest share of a loop's time that may go into writing checkpoints
 
 
-def chunks_of(units: int, most: int) -> tuple[int, int]:
+def equal_chunks(units: int, most: int) -> tuple[int, int]:
     """Returns how to divide work into chunks of equal size.
 
     Args:

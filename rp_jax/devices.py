@@ -82,7 +82,7 @@ def _specs(in_axes: Any) -> Any:
     return jax.tree.map(spec, in_axes, is_leaf=lambda axis: axis is None)
 
 
-def spread(function: Callable, in_axes: Any, mesh: Mesh | None) -> Callable:
+def sharded_vmap(function: Callable, in_axes: Any, mesh: Mesh | None) -> Callable:
     """Returns `jax.vmap(function, in_axes)` with its rows spread over the devices of a mesh.
 
     Each device runs the vmapped program on its own rows, without communication.
@@ -93,10 +93,10 @@ def spread(function: Callable, in_axes: Any, mesh: Mesh | None) -> Callable:
         mesh: the devices; None leaves everything on one device.
     """
     mapped = jax.vmap(function, in_axes)
-    return mapped if mesh is None else share_out(mapped, in_axes, mesh)
+    return mapped if mesh is None else shard_rows(mapped, in_axes, mesh)
 
 
-def share_out(function: Callable, in_axes: Any, mesh: Mesh) -> Callable:
+def shard_rows(function: Callable, in_axes: Any, mesh: Mesh) -> Callable:
     """Returns a function of whole batches that gives each device a part of the rows.
 
     Args:
@@ -108,13 +108,13 @@ def share_out(function: Callable, in_axes: Any, mesh: Mesh) -> Callable:
     return jax.shard_map(function, mesh=mesh, in_specs=specs, out_specs=P(ROWS), check_vma=False)
 
 
-def place(arguments: tuple, in_axes: Any, mesh: Mesh | None) -> tuple:
-    """Returns the arguments of a `spread` function, moved to the devices that need them.
+def shard_arguments(arguments: tuple, in_axes: Any, mesh: Mesh | None) -> tuple:
+    """Returns the arguments of a `sharded_vmap` function, moved to the devices that need them.
 
     Args:
         arguments: what the function will be called with.
-        in_axes: as given to `spread`.
-        mesh: as given to `spread`.
+        in_axes: as given to `sharded_vmap`.
+        mesh: as given to `sharded_vmap`.
     """
     if mesh is None:
         return arguments
@@ -127,12 +127,12 @@ def _same(*arguments: Any) -> tuple:
     return arguments
 
 
-def placed(shapes: Any, mesh: Mesh | None) -> Any:
-    """Returns shapes of rows together with the devices on which a `spread` function leaves them.
+def sharded_shapes(shapes: Any, mesh: Mesh | None) -> Any:
+    """Returns shapes of rows, with the devices on which a `sharded_vmap` function leaves them.
 
     Args:
         shapes: pytree of `jax.ShapeDtypeStruct`, each with a leading axis of rows.
-        mesh: as given to `spread`; None returns the shapes unchanged.
+        mesh: as given to `sharded_vmap`; None returns the shapes unchanged.
     """
     if mesh is None:
         return shapes
@@ -141,12 +141,12 @@ def placed(shapes: Any, mesh: Mesh | None) -> Any:
     return jax.tree.map(put, shapes)
 
 
-def returned(rows: Any, mesh: Mesh | None) -> Any:
-    """Moves rows to the devices on which a `spread` function would have left them.
+def shard(rows: Any, mesh: Mesh | None) -> Any:
+    """Moves rows to the devices on which a `sharded_vmap` function would have left them.
 
     Args:
         rows: pytree of arrays with a leading axis, for example read from a file.
-        mesh: as given to `spread`; None returns the rows unchanged.
+        mesh: as given to `sharded_vmap`; None returns the rows unchanged.
     """
     return rows if mesh is None else jax.device_put(rows, NamedSharding(mesh, P(ROWS)))
 
@@ -155,8 +155,8 @@ def gather(rows: Any, mesh: Mesh | None) -> Any:
     """Returns all rows in the memory of every process.
 
     Args:
-        rows: result of a `spread` function.
-        mesh: as given to `spread`; None returns the rows unchanged.
+        rows: result of a `sharded_vmap` function.
+        mesh: as given to `sharded_vmap`; None returns the rows unchanged.
     """
     if mesh is None:
         return rows
@@ -165,7 +165,7 @@ def gather(rows: Any, mesh: Mesh | None) -> Any:
     return multihost_utils.process_allgather(rows, tiled=True)
 
 
-def agreed(tree: Any) -> Any:
+def broadcast_first(tree: Any) -> Any:
     """Returns the first process's values on every process.
 
     Machines may differ in the last bits of what they compute; after this call they do not.

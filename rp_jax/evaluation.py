@@ -14,10 +14,10 @@ from rp_jax import shield, statistics
 from rp_jax.arrays import select
 from rp_jax.envs import optional
 from rp_jax.envs.contract import Env
-from rp_jax.planning.percept import Percept, faults
+from rp_jax.planning.percept import Percept, non_finite
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.rollout import Policy, Step, rollout
-from rp_jax.validate import finite, leading, none_bad, number, random_key
+from rp_jax.validate import finite, none_bad, number, random_key, shared_length
 
 
 class Episodes(NamedTuple):
@@ -53,7 +53,7 @@ def shielded(values: Callable[[Percept], Array]) -> Policy:
 
     def choose(_: Array, percept: Percept) -> tuple[Array, Array]:
         scores = values(percept)
-        leading(admissible=percept.admissible, values=scores)
+        shared_length(admissible=percept.admissible, values=scores)
         action = jax.vmap(shield.masked_argmax)(scores, percept.admissible)
         return action, jnp.argmax(scores, axis=-1) != action
 
@@ -150,7 +150,7 @@ def counting(env: Env, params: Any) -> Callable[[Episodes, Step], Episodes]:
     hits = functools.partial(optional.collisions, env)
 
     def fold(rows: Episodes, step: Step) -> Episodes:
-        bad_observation, bad_threat = faults(step.percept.encoded, step.percept.threat)
+        bad_observation, bad_threat = non_finite(step.percept.encoded, step.percept.threat)
         new = Episodes(
             score=step.outcome.reward,
             danger=step.outcome.danger,

@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from rp_jax.evaluation import shielded
-from rp_jax.planning.percept import Percept, faults
+from rp_jax.planning.percept import Percept, non_finite
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.rollout import Step, rollout
 
@@ -90,7 +90,7 @@ def advance(key: Array, paths: Paths, pmdp: PMDP, values: Values, level: Array) 
     def fold(paths: Paths, step: Step) -> Paths:
         least = jnp.where(step.alive, jnp.min(step.percept.threat, axis=-1), 0.0)
         crashed = step.moved & (step.outcome.danger > 0)
-        bad_observation, bad_threat = faults(step.percept.encoded, step.percept.threat)
+        bad_observation, bad_threat = non_finite(step.percept.encoded, step.percept.threat)
         return paths._replace(
             highest=jnp.maximum(paths.highest, least),
             crashed=paths.crashed | crashed,

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rp_jax.validate import leading, number, random_key, ranked
+from rp_jax.validate import number, random_key, ranked, shared_length
 
 
 class Shield(NamedTuple):
@@ -102,7 +102,7 @@ def masked_argmax(values: Array, admissible: Array) -> Array:
         ValueError: the arguments are not two arrays of one length.
     """
     ranked(1, values=values, admissible=admissible)
-    leading(admissible=admissible, values=values)
+    shared_length(admissible=admissible, values=values)
     return jnp.argmax(jnp.where(admissible, values, -jnp.inf))
 
 

@@ -65,7 +65,7 @@ def _write(path: Path, parts: Iterable[memoryview]) -> None:
         raise
 
 
-def sweep(folder: Path) -> None:
+def remove_partial_files(folder: Path) -> None:
     """Removes the temporary files of writes that were interrupted.
 
     Args:
@@ -254,7 +254,7 @@ def _arrays_file(folder: Path, sha256: str) -> Path:
     return folder / f"arrays-{sha256[:16]}.bin"
 
 
-def seal(manifest: Mapping[str, Any]) -> str:
+def manifest_checksum(manifest: Mapping[str, Any]) -> str:
     """Returns the checksum of a manifest.
 
     Args:
@@ -307,7 +307,7 @@ def save(folder: Path, kind: str, tree: Any, about: Mapping[str, Any]) -> None:
     )
     file = _arrays_file(folder, manifest["sha256"])
     _write(file, raw)
-    write_json(folder / "manifest.json", {**manifest, "seal": seal(manifest)})
+    write_json(folder / "manifest.json", {**manifest, "seal": manifest_checksum(manifest)})
     for old in folder.glob("arrays*"):
         if old != file:
             with contextlib.suppress(OSError):
@@ -345,7 +345,7 @@ def read_manifest(folder: Path, kind: str) -> dict[str, Any]:
         raise StorageError(f"{path}: kind is {manifest.get('kind')!r}; it must be {kind!r}")
     if not isinstance(manifest.get("about"), dict) or not isinstance(manifest.get("arrays"), dict):
         raise StorageError(f"{path}: the fields 'about' and 'arrays' must be tables")
-    if manifest.get("seal") != seal(manifest):
+    if manifest.get("seal") != manifest_checksum(manifest):
         raise StorageError(f"{path}: the checksum differs from its seal; it is damaged")
     return manifest
 

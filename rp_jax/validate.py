@@ -156,7 +156,7 @@ def ranked(rank: int, **arrays: Any) -> None:
             raise ValueError(f"{field} is {shown(array)}; it must be an array of {axes}")
 
 
-def leading(**trees: Any) -> int:
+def shared_length(**trees: Any) -> int:
     """Returns the length of the leading axis that all arrays of some pytrees share.
 
     Args:

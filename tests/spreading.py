@@ -32,11 +32,13 @@ def learner(mesh):
     def learn(key, pmdp):
         return loop.chunk(loop.init(key, pmdp, LOOP)[0], pmdp, LOOP, 20)[0].learner.params
 
-    program = jax.jit(devices.spread(learn, axes, mesh))
+    program = jax.jit(devices.sharded_vmap(learn, axes, mesh))
 
     def run(seeds):
         keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
-        given = devices.place((keys, pmdp.replace(x=jnp.full(len(seeds), 0.5))), axes, mesh)
+        given = devices.shard_arguments(
+            (keys, pmdp.replace(x=jnp.full(len(seeds), 0.5))), axes, mesh
+        )
         return jax.device_get(devices.gather(program(*given), mesh))
 
     return run

@@ -19,7 +19,7 @@ def same_bits(a, b):
 @given(hnp.arrays(bool, 13), st.sampled_from([1, 4, 40]))
 def test_renew_makes_exactly_the_marked_rows(where, chunk):
     rows = {"a": jnp.arange(13.0), "b": jnp.arange(26).reshape(13, 2)}
-    renewed = renew(jnp.asarray(where), rows, chunk)
+    renewed = replace_rows(jnp.asarray(where), rows, chunk)
     new = make(jnp.arange(13))
     expected = {
         "a": jnp.where(where, new["a"], rows["a"]),
@@ -33,8 +33,8 @@ def make(indices):
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def renew(where, rows, chunk):
-    return arrays.renew(where, rows, make, chunk)
+def replace_rows(where, rows, chunk):
+    return arrays.replace_rows(where, rows, make, chunk)
 
 
 @pytest.mark.parametrize("marked", [[], [12], [1, 5, 7, 8, 12], list(range(13))])
@@ -49,7 +49,7 @@ def test_renew_computes_no_row_that_is_not_marked(marked, chunk):
     where = jnp.asarray([i in marked for i in range(13)])
     rows = {"a": jnp.arange(13.0), "b": jnp.arange(26).reshape(13, 2)}
     with jax.disable_jit():  # so that the loop runs in Python, and calls are seen
-        arrays.renew(where, rows, recorded, chunk)
+        arrays.replace_rows(where, rows, recorded, chunk)
     assert len(asked) == -(-len(marked) // chunk)
     assert all(len(indices) == chunk for indices in asked)
     assert sorted(i for indices in asked for i in indices if i < 13) == marked
@@ -59,7 +59,7 @@ def test_renew_keeps_the_rows_of_any_pytree_with_typed_keys():
     keys = jax.random.split(jax.random.key(0), 5)
     others = jax.random.split(jax.random.key(1), 5)
     where = jnp.asarray([True, False, False, True, False])
-    renewed = arrays.renew(where, (keys,), lambda i: (others.at[i].get(mode="clip"),), 2)
+    renewed = arrays.replace_rows(where, (keys,), lambda i: (others.at[i].get(mode="clip"),), 2)
     expected = np.where(where[:, None], jax.random.key_data(others), jax.random.key_data(keys))
     np.testing.assert_array_equal(jax.random.key_data(renewed[0]), expected)
 

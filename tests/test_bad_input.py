@@ -137,7 +137,7 @@ ENVS = {
     circuit: "track time_limit radius horizon beta fidelity baseline",
     jam: "num_obstacles time_limit radius beta fewest wall_horizon obstacle_horizon fidelity "
     "baseline",
-    point_gather: "n_apples n_bombs time_limit horizon beta fidelity",
+    point_gather: "num_apples num_bombs time_limit horizon beta fidelity",
 }
 arguments = st.sampled_from(sorted(ENVS, key=lambda env: env.__name__)).flatmap(
     lambda env: st.tuples(
@@ -259,7 +259,7 @@ def fitted(key=KEY, data=DATA, **changes):
 
 
 def built(key=KEY, x=0.5, **changes):
-    return build.build(key, SUB, dataclasses.replace(build.ThreatConfig(), **changes), x)
+    return build.learn_threat(key, SUB, dataclasses.replace(build.ThreatConfig(), **changes), x)
 
 
 WRONG = {

@@ -67,20 +67,20 @@ def test_a_cluster_that_is_none_is_refused(monkeypatch):
 def test_without_a_mesh_all_is_as_ever():
     assert devices.mesh_of("one") is None
     rows, scale = jnp.arange(3.0), jnp.asarray(2.0)
-    assert devices.place((rows, scale), (0, None), None) == (rows, scale)
-    doubled = devices.spread(lambda a, b: a * b, (0, None), None)(rows, scale)
+    assert devices.shard_arguments((rows, scale), (0, None), None) == (rows, scale)
+    doubled = devices.sharded_vmap(lambda a, b: a * b, (0, None), None)(rows, scale)
     np.testing.assert_array_equal(devices.gather(doubled, None), [0, 2, 4])
-    assert devices.placed(rows, None) is rows
-    assert devices.agreed(rows) is rows
+    assert devices.sharded_shapes(rows, None) is rows
+    assert devices.broadcast_first(rows) is rows
     assert devices.is_first()
 
 
 def test_one_device_spread_is_one_device():
     mesh = devices.mesh_of("all")
-    (rows,) = devices.place((jnp.arange(4.0 * mesh.size),), (0,), mesh)
-    tripled = devices.spread(lambda a: 3 * a, (0,), mesh)(rows)
+    (rows,) = devices.shard_arguments((jnp.arange(4.0 * mesh.size),), (0,), mesh)
+    tripled = devices.sharded_vmap(lambda a: 3 * a, (0,), mesh)(rows)
     np.testing.assert_array_equal(devices.gather(tripled, mesh), 3 * np.arange(4.0 * mesh.size))
-    assert devices.placed(rows, mesh).sharding.mesh == mesh
+    assert devices.sharded_shapes(rows, mesh).sharding.mesh == mesh
 
 
 def test_rows_that_cannot_be_shared_out_are_named():

@@ -77,7 +77,7 @@ def test_what_a_killed_write_left_is_swept_up(tmp_path):
     assert subprocess.run([sys.executable, "-c", code]).returncode == -signal.SIGKILL
     (inner / ".hidden").touch()
     assert len(list(inner.iterdir())) == 3
-    storage.sweep(tmp_path)
+    storage.remove_partial_files(tmp_path)
     assert {path.name for path in inner.iterdir()} == {"file", ".hidden"}
     assert (inner / "file").read_bytes() == b"old"
 
@@ -287,12 +287,12 @@ def test_nothing_is_read_for_a_forged_size(tmp_path, monkeypatch):
     for shape in ([10**12], [2**62, 8], [-1], [2, 10**9], "2", None, [1.5]):
         forged = json.loads(json.dumps(manifest))
         forged["arrays"]["a"]["shape"] = shape
-        path.write_text(json.dumps({**forged, "seal": storage.seal(forged)}))
+        path.write_text(json.dumps({**forged, "seal": storage.manifest_checksum(forged)}))
         with pytest.raises(StorageError, match=r"a is .*; it must be"):
             storage.load(tmp_path, "thing", SMALL)
     for change in ({"bytes": 10**15}, {"bytes": None}, {"sha256": "../../x"}, {"sha256": 3}):
         forged = {**manifest, **change}
-        path.write_text(json.dumps({**forged, "seal": storage.seal(forged)}))
+        path.write_text(json.dumps({**forged, "seal": storage.manifest_checksum(forged)}))
         with pytest.raises(StorageError, match="cannot be right"):
             storage.load(tmp_path, "thing", SMALL)
 

@@ -13,7 +13,7 @@ from rp_jax.dynamics import (
     independent_controls,
     make_vehicle,
     squared_distance,
-    to_ego,
+    to_body_frame,
 )
 from rp_jax.envs import contract
 from rp_jax.hazards import SubRMDP, WallPoint, Window, padded_window, sample_speed
@@ -69,12 +69,12 @@ class Pedestrian(struct.PyTreeNode):
 
     def in_reach(self, body: Vehicle, hazard: Walker) -> Array:
         """Returns whether it is in the window."""
-        return self.window.contains(to_ego(hazard.position - body.position, body.heading))
+        return self.window.contains(to_body_frame(hazard.position - body.position, body.heading))
 
     def features(self, body: Vehicle, hazard: Walker) -> Array:
         """Returns (5,), in the car's frame: position (2), way (2); the car's speed."""
-        relative = to_ego(hazard.position - body.position, body.heading)
-        way = to_ego(hazard.way, body.heading)
+        relative = to_body_frame(hazard.position - body.position, body.heading)
+        way = to_body_frame(hazard.way, body.heading)
         return jnp.concatenate([relative, way, body.speed[None]])
 
     def mirrored(self, features: Array) -> Array:

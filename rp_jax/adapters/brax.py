@@ -165,7 +165,7 @@ class FreshResets(Wrapper):
             return fresh.pipeline_state, fresh.obs
 
         seen = reached.pipeline_state, reached.obs
-        pipeline_state, obs = arrays.renew(reached.done > 0, seen, starts)
+        pipeline_state, obs = arrays.replace_rows(reached.done > 0, seen, starts)
         info = reached.info | {"reset_key": later, "final_obs": reached.obs}
         return reached.replace(pipeline_state=pipeline_state, obs=obs, info=info)
 

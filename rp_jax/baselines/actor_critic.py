@@ -17,7 +17,7 @@ from jax import Array
 
 from rp_jax.baselines.policies import ACTORS, Critic
 from rp_jax.envs import autoreset, optional, tally
-from rp_jax.planning.percept import Encoded, Percept, faults
+from rp_jax.planning.percept import Encoded, Percept, non_finite
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import number, one_of
 
@@ -292,7 +292,7 @@ def collect(
         running, ended = tally.tally(running, outcome)
         earned = config.gamma * earned + reward
         dtype = ended.score.dtype
-        bad_observation, bad_signal = faults(encoded, signal)
+        bad_observation, bad_signal = non_finite(encoded, signal)
         metrics = ActorCriticMetrics(
             steps=jnp.asarray(config.num_envs, dtype),
             **ended._asdict(),

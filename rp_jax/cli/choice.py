@@ -114,7 +114,7 @@ def chosen(choice: Choice) -> Chosen:
         except TypeError as error:
             raise ValueError(f"set is {choice.set}; it must fit make_params ({error})") from error
         if agents.threat is not None:
-            agents.threat.fits(agents.pmdp.env.sub_rmdps(params))
+            agents.threat.check_fits(agents.pmdp.env.sub_rmdps(params))
         pmdp = agents.pmdp.replace(params=params)
         agents = Agents(
             pmdp, agents.network, agents.weights, agents.members, agents.config, agents.threat

@@ -43,7 +43,7 @@ def resumable(again: str, folder: Path, finish: Callable[[], None]) -> Iterator[
         with bad_input():
             stack.enter_context(storage.locked(folder / record.CHECKPOINTS, record.LOCK))
         stack.enter_context(_terminated_as_interrupted())
-        storage.sweep(folder)
+        storage.remove_partial_files(folder)
         try:
             yield
         except KeyboardInterrupt as stop:

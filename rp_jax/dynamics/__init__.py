@@ -9,7 +9,7 @@ from rp_jax.dynamics.baseline import (
     make_plans,
 )
 from rp_jax.dynamics.body import Body, VehicleModel, delayed, num_threats
-from rp_jax.dynamics.geometry import angle_of, rotate, squared_distance, to_ego
+from rp_jax.dynamics.geometry import angle_of, rotate, squared_distance, to_body_frame
 from rp_jax.dynamics.vehicle import Control, Vehicle, advance, make_vehicle
 
 __all__ = [
@@ -32,5 +32,5 @@ __all__ = [
     "num_threats",
     "rotate",
     "squared_distance",
-    "to_ego",
+    "to_body_frame",
 ]

@@ -142,7 +142,7 @@ def make_plans(
     targets: Sequence[float],
     steps: int,
     max_acceleration: float,
-    fastest: float,
+    max_speed: float,
 ) -> Plans:
     """Returns plans that brake at once, or after some steps at a target speed, with every turn.
 
@@ -151,14 +151,14 @@ def make_plans(
         targets: speeds to keep before braking, room units / step; braking at once is always added.
         steps: number of steps for which a target speed is kept.
         max_acceleration: greatest change of speed in a step, room units / step^2.
-        fastest: greatest speed of the vehicle in either direction, room units / step.
+        max_speed: greatest speed of the vehicle in either direction, room units / step.
 
     Returns:
         (1 + len(targets)) * len(turns) plans; the turn varies fastest.
     """
     speeds, waits = (0.0, *targets), (0, *[steps] * len(targets))
     rotation = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
-    braking = int(np.ceil(fastest / max_acceleration - 1e-6))
+    braking = int(np.ceil(max_speed / max_acceleration - 1e-6))
     return Plans(
         rotation=jnp.asarray(np.tile(rotation, (len(speeds), 1)), float),
         target=jnp.asarray(np.repeat(speeds, len(turns)), float),

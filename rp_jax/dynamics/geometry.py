@@ -19,7 +19,7 @@ def rotate(vector: Array, rotation: Array) -> Array:
     return jnp.stack([x * c - y * s, x * s + y * c], axis=-1)
 
 
-def to_ego(vector: Array, heading: Array) -> Array:
+def to_body_frame(vector: Array, heading: Array) -> Array:
     """Expresses vectors in the frame whose x axis is a given heading.
 
     Args:

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 from jax import Array
 
-from rp_jax.arrays import renew
+from rp_jax.arrays import replace_rows
 from rp_jax.envs.contract import Env, Outcome
 
 
@@ -44,7 +44,7 @@ def step_and_renew(
         return fresh, look(fresh)
 
     seen = (reached, look(reached))
-    return renew(outcome.done, seen, starts), seen, outcome
+    return replace_rows(outcome.done, seen, starts), seen, outcome
 
 
 def auto_reset_step(

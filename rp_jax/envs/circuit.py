@@ -16,7 +16,7 @@ from rp_jax.dynamics import (
     make_plans,
     make_vehicle,
     rotate,
-    to_ego,
+    to_body_frame,
 )
 from rp_jax.envs import contract, sensing, tracks, walls
 from rp_jax.hazards import SubRMDP, WallPoint
@@ -220,7 +220,7 @@ def observe(state: State, params: Params) -> Array:
     body, track = state.body, params.track
     points = track.walls_in_view.near(body.position)
     scan = sensing.lidar(points, body.position, body.heading, LIDAR_BINS, tracks.VIEW)
-    bend = angle_of(to_ego(track.onward[state.index], body.heading))
+    bend = angle_of(to_body_frame(track.onward[state.index], body.heading))
     place = jnp.where(state.hide_position, 0.0, body.position)
     return jnp.concatenate([scan, place, jnp.stack([bend, body.speed])])
 

@@ -18,7 +18,7 @@ from rp_jax.dynamics import (
     make_plans,
     make_vehicle,
     squared_distance,
-    to_ego,
+    to_body_frame,
 )
 from rp_jax.envs import contract, sensing
 from rp_jax.envs.walls import FARTHEST, least_radius
@@ -388,8 +388,8 @@ def _seen_obstacles(state: State) -> Array:
     offset = jnp.where(present[:, None], offset, jnp.asarray(UNSEEN, offset.dtype)[None])
     facing = jnp.where(present[:, None], others.heading, -body.heading[None])
     speed = jnp.where(present, others.speed, body.speed)
-    local = to_ego(offset, body.heading)
-    turn = angle_of(to_ego(facing, body.heading))
+    local = to_body_frame(offset, body.heading)
+    turn = angle_of(to_body_frame(facing, body.heading))
     rows = jnp.concatenate([local, turn[:, None], speed[:, None]], axis=-1)
     squared = jnp.sum(jnp.square(offset), axis=-1)
     nearest = arrays.ranks(squared)

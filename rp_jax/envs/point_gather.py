@@ -21,7 +21,7 @@ from rp_jax.dynamics import (
     independent_controls,
     make_vehicle,
     squared_distance,
-    to_ego,
+    to_body_frame,
 )
 from rp_jax.envs import contract
 from rp_jax.hazards import Bomb, SubRMDP
@@ -75,8 +75,8 @@ class Params(struct.PyTreeNode):
     bomb: Bomb
     time_limit: Array  # () int32, steps of an episode
     beta: Array  # () discount of danger in the threat
-    n_apples: int = struct.field(pytree_node=False, default=2)
-    n_bombs: int = struct.field(pytree_node=False, default=USUAL_BOMBS)
+    num_apples: int = struct.field(pytree_node=False, default=2)
+    num_bombs: int = struct.field(pytree_node=False, default=USUAL_BOMBS)
 
 
 def cells() -> np.ndarray:
@@ -90,8 +90,8 @@ def cells() -> np.ndarray:
 
 
 def make_params(
-    n_apples: int = 2,
-    n_bombs: int = USUAL_BOMBS,
+    num_apples: int = 2,
+    num_bombs: int = USUAL_BOMBS,
     *,
     time_limit: int = 15,
     horizon: int = 15,
@@ -101,8 +101,8 @@ def make_params(
     """Returns the task's parameters, checked.
 
     Args:
-        n_apples: number of apples; 2 in the paper.
-        n_bombs: number of bombs; 8 in the paper.
+        num_apples: number of apples; 2 in the paper.
+        num_bombs: number of bombs; 8 in the paper.
         time_limit: steps of an episode.
         horizon: steps after which a rollout of the threat is cut; the default cuts nothing off.
         beta: discount of danger in the threat.
@@ -114,10 +114,10 @@ def make_params(
     """
     one_of("fidelity", fidelity, contract.FIDELITIES)
     room = len(cells())
-    number("n_bombs", n_bombs, least=1, most=room, integer=True)
+    number("num_bombs", num_bombs, least=1, most=room, integer=True)
     # If two numbers do not fit together, the message names the one that differs from the paper's.
-    number("n_apples", n_apples, least=0, most=room - min(n_bombs, USUAL_BOMBS), integer=True)
-    number("n_bombs", n_bombs, least=1, most=room - n_apples, integer=True)
+    number("num_apples", num_apples, least=0, most=room - min(num_bombs, USUAL_BOMBS), integer=True)
+    number("num_bombs", num_bombs, least=1, most=room - num_apples, integer=True)
     positive("time_limit", time_limit, most=10**9, integer=True)
     positive("horizon", horizon, most=100, integer=True)
     positive("beta", beta, most=1.0)
@@ -133,8 +133,8 @@ def make_params(
         bomb=Bomb.create(body, REACH, horizon, AHEAD if fidelity == "released" else 0.0),
         time_limit=jnp.asarray(time_limit, jnp.int32),
         beta=jnp.asarray(beta, float),
-        n_apples=n_apples,
-        n_bombs=n_bombs,
+        num_apples=num_apples,
+        num_bombs=num_bombs,
     )
 
 
@@ -170,7 +170,9 @@ def reset(key: Array, params: Params) -> State:
     grid = jnp.asarray(cells(), float)
     order = arrays.ranks(jax.random.uniform(cell_key, (len(grid),)))
     shuffled = jnp.zeros_like(grid).at[order].set(grid)
-    apples, bombs, _ = jnp.split(shuffled, [params.n_apples, params.n_apples + params.n_bombs])
+    apples, bombs, _ = jnp.split(
+        shuffled, [params.num_apples, params.num_apples + params.num_bombs]
+    )
     state = start_at(pose[:2], pose[2], apples, bombs)
     return state.replace(velocity=0.1 * jax.random.normal(velocity_key, (3,)))
 
@@ -226,7 +228,7 @@ def _readings(body: Vehicle, objects: Objects, params: Params) -> Array:
     The bins divide the front half plane, from right to left; 0 stands for no object.
     """
     place = params.bomb.centre(body)
-    local = to_ego(objects.position - place[None], body.heading[None])
+    local = to_body_frame(objects.position - place[None], body.heading[None])
     distance = jnp.sqrt(squared_distance(local, jnp.zeros((1, 2))))
     # In front, an object lies to the left of an edge where their cross product is positive.
     edges = np.linspace(-np.pi / 2, np.pi / 2, BINS + 1)[1:-1]

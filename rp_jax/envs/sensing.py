@@ -9,7 +9,7 @@ from flax import struct
 from jax import Array
 from scipy.spatial import cKDTree
 
-from rp_jax.dynamics import squared_distance, to_ego
+from rp_jax.dynamics import squared_distance, to_body_frame
 
 FAR = 1e4  # coordinate of padding points, out of every range
 
@@ -229,7 +229,7 @@ def lidar(points: Array, position: Array, heading: Array, bins: int, view: float
     Returns:
         (bins,) distances, 0 where nothing is seen.
     """
-    local = to_ego(points - position[None], heading)
+    local = to_body_frame(points - position[None], heading)
     x, y = local[:, 0], local[:, 1]
     # The approximate angle gives the nearest edge, and the exact vectors the side of it.
     turn = (_approximate_angle(x, y) + jnp.pi) * (bins / (2 * jnp.pi))

@@ -165,13 +165,13 @@ class Track(struct.PyTreeNode):
     walls_in_reach: sensing.PointGrid  # finds wall points that may have a threat
 
 
-def make_track(plan: TrackPlan, radius: float, fastest: float, reach: float) -> Track:
+def make_track(plan: TrackPlan, radius: float, max_speed: float, reach: float) -> Track:
     """Checks a plan and returns the track with its look-up tables.
 
     Args:
         plan: a closed centre line.
         radius: radius of the vehicle, room units; a wall nearer than this is a crash.
-        fastest: length of the vehicle's longest step, room units.
+        max_speed: length of the vehicle's longest step, room units.
         reach: greatest distance at which a wall point can have a threat, room units.
 
     Raises:
@@ -183,7 +183,7 @@ def make_track(plan: TrackPlan, radius: float, fastest: float, reach: float) -> 
     direction = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     left = np.stack([-direction[:, 1], direction[:, 0]], axis=-1) * plan.half_width
     sides = np.stack([centre + left, centre - left], axis=1)  # (n, 2, 2)
-    _check_walls(sides, radius, fastest)
+    _check_walls(sides, radius, max_speed)
     walls = sides.reshape(-1, 2)
     # Coinciding points (the hub of a tight turn) are a single event: counting it once keeps the
     # bound of Theorem 3, and makes it tighter.
@@ -214,20 +214,20 @@ def _steps(points: np.ndarray) -> np.ndarray:
     return np.roll(points, -1, axis=0) - points
 
 
-def _check_walls(sides: np.ndarray, radius: float, fastest: float) -> None:
+def _check_walls(sides: np.ndarray, radius: float, max_speed: float) -> None:
     """Raises ValueError if a vehicle could slip between two points of a wall.
 
     Args:
         sides: (n, 2, 2) points of both walls, in order.
         radius: radius of the vehicle, room units.
-        fastest: length of the vehicle's longest step, room units.
+        max_speed: length of the vehicle's longest step, room units.
     """
     gaps = np.linalg.norm(_steps(sides), axis=-1).max(axis=1)
-    i, least = int(gaps.argmax()), least_radius(float(gaps.max()), fastest)
+    i, least = int(gaps.argmax()), least_radius(float(gaps.max()), max_speed)
     if radius <= least:
         raise ValueError(
             f"track: at centre point {i} points of a wall are {gaps[i]:.3f} apart; for steps of "
-            f"{fastest:g} the vehicle's radius, {radius:g}, must exceed {least:.4f}"
+            f"{max_speed:g} the vehicle's radius, {radius:g}, must exceed {least:.4f}"
         )
 
 

@@ -11,7 +11,7 @@ from rp_jax.dynamics import (
     make_vehicle,
     rotate,
     squared_distance,
-    to_ego,
+    to_body_frame,
 )
 from rp_jax.hazards.reach import Reach, Window
 from rp_jax.hazards.wall_point import WallPoint
@@ -84,8 +84,8 @@ class Bomb(WallPoint):
             (6,) the bomb's position (2), the room's centre (2), (cos, sin) of 4 times the heading
             (2).
         """
-        relative = to_ego(hazard - body.position, body.heading)
-        centre = to_ego(-body.position, body.heading)
+        relative = to_body_frame(hazard - body.position, body.heading)
+        centre = to_body_frame(-body.position, body.heading)
         twice = rotate(body.heading, body.heading)
         return jnp.concatenate([relative, centre, rotate(twice, twice)])
 

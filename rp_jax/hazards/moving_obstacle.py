@@ -12,7 +12,7 @@ from rp_jax.dynamics import (
     advance,
     make_vehicle,
     squared_distance,
-    to_ego,
+    to_body_frame,
 )
 from rp_jax.hazards.reach import MARGIN, Reach, Window, sample_speed, union
 
@@ -80,7 +80,7 @@ class MovingObstacle(struct.PyTreeNode):
             body: the state of the agent's vehicle.
             hazard: the obstacle's state.
         """
-        relative = to_ego(hazard.position - body.position, body.heading)
+        relative = to_body_frame(hazard.position - body.position, body.heading)
         return self.window_at(body.speed, hazard.speed).contains(relative)
 
     def draw(self, key: Array, shape: tuple[int, ...] = ()):
@@ -124,8 +124,8 @@ class MovingObstacle(struct.PyTreeNode):
         Returns:
             (6,) the obstacle's position (2), its heading (cos, sin), its speed, the body's speed.
         """
-        relative = to_ego(hazard.position - body.position, body.heading)
-        heading = to_ego(hazard.heading, body.heading)
+        relative = to_body_frame(hazard.position - body.position, body.heading)
+        heading = to_body_frame(hazard.heading, body.heading)
         speeds = jnp.stack([hazard.speed, body.speed])
         return jnp.concatenate([relative, heading, speeds])
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rp_jax.dynamics import Vehicle, VehicleModel, make_vehicle, squared_distance, to_ego
+from rp_jax.dynamics import Vehicle, VehicleModel, make_vehicle, squared_distance, to_body_frame
 from rp_jax.hazards.reach import MARGIN, Reach, Window, sample_speed, union
 
 
@@ -52,7 +52,7 @@ class WallPoint(struct.PyTreeNode):
             body: the body's state.
             hazard: (2,) position of the point.
         """
-        relative = to_ego(hazard - body.position, body.heading)
+        relative = to_body_frame(hazard - body.position, body.heading)
         return self.window_at(body.speed).contains(relative)
 
     def draw(self, key: Array, shape: tuple[int, ...] = ()) -> Array:
@@ -93,7 +93,7 @@ class WallPoint(struct.PyTreeNode):
         Returns:
             (3,) the point's position (2), the body's speed.
         """
-        relative = to_ego(hazard - body.position, body.heading)
+        relative = to_body_frame(hazard - body.position, body.heading)
         return jnp.concatenate([relative, body.speed[None]])
 
     def mirrored(self, features: Array) -> Array:

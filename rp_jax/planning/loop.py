@@ -15,8 +15,8 @@ from rp_jax.envs import autoreset, optional, tally
 from rp_jax.planning import dqn
 from rp_jax.planning.dqn import DQNConfig, Learner, Transition
 from rp_jax.planning.networks import NETWORKS
-from rp_jax.planning.nstep import Taken, n_step_transition
-from rp_jax.planning.percept import Percept, faults
+from rp_jax.planning.nstep import WindowStep, n_step_transition
+from rp_jax.planning.percept import Percept, non_finite
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.validate import finite, none_bad, number, one_of, random_key
 
@@ -103,7 +103,7 @@ class LoopState(NamedTuple):
     states: Any  # (B,) environment states
     seen: Percept  # of those states
     running: tally.Running  # (B,) episodes
-    window: Taken  # (n_step, B), oldest first
+    window: WindowStep  # (n_step, B), oldest first
     learner: Learner
     replay: Any
     key: Array
@@ -199,7 +199,7 @@ def interact(
         pmdp.perceive,
     )
     insecure = ~seen.secure & ~outcome.terminated
-    taken = Taken(
+    taken = WindowStep(
         encoded=state.seen.encoded,
         action=action,
         reward=outcome.reward - pmdp.penalty * outcome.danger - pmdp.insecure_penalty * insecure,
@@ -210,7 +210,7 @@ def interact(
     )
     running, ended = tally.tally(state.running, outcome)
     dtype = ended.score.dtype
-    bad_observation, bad_threat = faults(state.seen.encoded, state.seen.threat)
+    bad_observation, bad_threat = non_finite(state.seen.encoded, state.seen.threat)
     metrics = LoopMetrics(
         steps=jnp.asarray(batch, dtype),
         **ended._asdict(),
@@ -258,7 +258,9 @@ def begin(key: Array, pmdp: PMDP, config: LoopConfig) -> LoopState:
     encoded, admissible, _, threat, _ = seen
     zeros = jnp.zeros(batch, threat.dtype)
     false = jnp.zeros(batch, bool)
-    taken = Taken(encoded, jnp.zeros(batch, jnp.int32), zeros, false, false, encoded, admissible)
+    taken = WindowStep(
+        encoded, jnp.zeros(batch, jnp.int32), zeros, false, false, encoded, admissible
+    )
     window = jax.tree.map(lambda a: jnp.stack([a] * config.n_step), taken)
     example = _oldest(window, config)
     return LoopState(
@@ -300,7 +302,7 @@ def emptied(state: LoopState, config: LoopConfig) -> LoopState:
     return state._replace(replay=make_replay(config).init(example))
 
 
-def _oldest(window: Taken, config: LoopConfig) -> Transition:
+def _oldest(window: WindowStep, config: LoopConfig) -> Transition:
     """(B,) transitions from the oldest steps of the windows."""
     return jax.vmap(n_step_transition, (1, None))(window, config.learner.gamma)
 

@@ -10,7 +10,7 @@ from rp_jax.planning.dqn import Transition
 from rp_jax.planning.percept import Encoded
 
 
-class Taken(NamedTuple):
+class WindowStep(NamedTuple):
     """One step of every environment, as the window keeps it."""
 
     encoded: Encoded  # (B,) observations before the step
@@ -22,7 +22,7 @@ class Taken(NamedTuple):
     next_admissible: Array  # (B, A) bool, the admissible actions after the step
 
 
-def n_step_transition(window: Taken, gamma: float) -> Transition:
+def n_step_transition(window: WindowStep, gamma: float) -> Transition:
     """Returns the transition from a window's first state to its last, or to an episode's end in it.
 
     Args:

@@ -42,7 +42,7 @@ def encode(observation: Array, scan: int, pool: int) -> Encoded:
     return Encoded(jnp.round(nearest * 255).astype(jnp.uint8), rest)
 
 
-def faults(encoded: Encoded, threat: Array) -> tuple[Array, Array]:
+def non_finite(encoded: Encoded, threat: Array) -> tuple[Array, Array]:
     """Returns for which states the observation, or a threat, is nan or infinite.
 
     Args:

@@ -8,13 +8,13 @@ from flax import struct
 from jax import Array
 
 from rp_jax import shield
-from rp_jax.arrays import renew
+from rp_jax.arrays import replace_rows
 from rp_jax.dynamics import Plans
 from rp_jax.envs import optional
 from rp_jax.envs.contract import Env, Outcome
 from rp_jax.planning.percept import Percept, encode
 from rp_jax.threat.model import ThreatModel
-from rp_jax.threat.static import bounded, plan_clearance, static_threat
+from rp_jax.threat.static import compress_above_one, plan_clearance, static_threat
 from rp_jax.threat.total import total_threat
 
 OUTCOMES = 0x100C  # seed for sampled outcomes of actions; no environment's keys come from it
@@ -107,7 +107,7 @@ class PMDP(struct.PyTreeNode):
             return jnp.minimum(summed.at[rows].get(mode="clip"), self._backup(chosen))
 
         insecure = jnp.min(summed, axis=-1) > self.thresholds(states)
-        return renew(insecure, summed, closer, chunk=4)
+        return replace_rows(insecure, summed, closer, chunk=4)
 
     def _static(self, bodies: Any) -> Array | None:
         """Returns the joint threats of the fixed hazards by plan, (B, K, A); None without plans."""
@@ -138,7 +138,7 @@ class PMDP(struct.PyTreeNode):
         if static is None:
             return total_threat(self.threats, states.body, hazards)
         if hazards:
-            moving = bounded(total_threat(self.threats, states.body, hazards))
+            moving = compress_above_one(total_threat(self.threats, states.body, hazards))
             static = static + moving.reshape(static.shape)
         best = jnp.min(static, axis=1)
         return best if alive is None else jnp.where(alive[:, None], best, 0.0)

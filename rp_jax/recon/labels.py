@@ -21,7 +21,7 @@ from rp_jax import devices
 from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
 from rp_jax.dynamics import ControlDistribution, Plans, VehicleModel, delayed, num_threats
 from rp_jax.hazards import SubRMDP, is_static
-from rp_jax.validate import finite, leading, number, random_key
+from rp_jax.validate import finite, number, random_key, shared_length
 
 
 class Labels(struct.PyTreeNode):
@@ -283,7 +283,7 @@ def label_rows(
     keys = jax.random.split(key, count)
     if mesh is None:
         return several(keys, body, hazard, sub)
-    return devices.share_out(several, (0, 0, 0, None), mesh)(keys, body, hazard, sub)
+    return devices.shard_rows(several, (0, 0, 0, None), mesh)(keys, body, hazard, sub)
 
 
 def label(
@@ -321,7 +321,7 @@ def label(
         FloatingPointError: a label is not a finite number.
     """
     random_key("key", key)
-    count = leading(body=body, hazard=hazard)
+    count = shared_length(body=body, hazard=hazard)
     number("batch", batch, least=1, integer=True)
     rows = min(int(number("rows", rows, least=1, integer=True)), count)
     rows += 0 if mesh is None else -rows % mesh.size

@@ -101,7 +101,7 @@ def certify(
         world = env or pmdp.env
         given = pmdp.params if params is None else params
         if agents.threat is not None:
-            agents.threat.fits(world.sub_rmdps(given))
+            agents.threat.check_fits(world.sub_rmdps(given))
         pmdp = pmdp.replace(env=world, params=given)
     if on_plan is not None:
         on_plan(n, allowed)

@@ -71,7 +71,7 @@ def evaluate(
         world = env or pmdp.env
         given = pmdp.params if params is None else params
         if several.threat is not None:
-            several.threat.fits(world.sub_rmdps(given))
+            several.threat.check_fits(world.sub_rmdps(given))
         pmdp = pmdp.replace(env=world, params=given)
     spec = {
         "env": record.name_of(pmdp.env),
@@ -147,7 +147,7 @@ def play_all(
         return evaluation.play_round(key, pmdp, players.policy(weights), batch)
 
     mesh, places = sharing.mesh_of(devices), (0, 0, axes)
-    everyone = jax.jit(sharing.spread(one, places, mesh))
+    everyone = jax.jit(sharing.sharded_vmap(one, places, mesh))
     numbers = [member.seed for member in players.members]
     keys = numbered(key_of(key, Stream.EVALUATION), numbers)
     each = jax.vmap(lambda key: evaluation.round_keys(key, episodes, batch))(keys)
@@ -156,7 +156,7 @@ def play_all(
     def play(turn: int, found: evaluation.Episodes) -> evaluation.Episodes:
         begun = f"{turn * batch * count:,} of {rounds * batch * count:,} episodes"
         on_progress(stage, turn, rounds, begun)
-        given = sharing.place((each[:, turn], players.weights, several), places, mesh)
+        given = sharing.shard_arguments((each[:, turn], players.weights, several), places, mesh)
         new = jax.tree.map(np.asarray, sharing.gather(everyone(*given), mesh))
         evaluation.check(new, stage)
         for whole, part in zip(jax.tree.leaves(found), jax.tree.leaves(new), strict=True):

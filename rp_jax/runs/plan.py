@@ -14,7 +14,7 @@ from jax import Array
 from jax.sharding import Mesh
 
 from rp_jax import devices as sharing
-from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints, chunks_of
+from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints, equal_chunks
 from rp_jax.envs import optional
 from rp_jax.envs.check import check_contract
 from rp_jax.envs.contract import Env
@@ -209,7 +209,7 @@ def make_pmdp(
     if threat is not None:
         if not isinstance(threat, ThreatFunction):
             raise ValueError(f"threat is {type(threat).__name__}; it must be a ThreatFunction")
-        threat.fits(env.sub_rmdps(params))
+        threat.check_fits(env.sub_rmdps(params))
     pool, bins = POOLS[(config or LoopConfig()).network], optional.lidar_bins(env)
     if bins % pool:
         raise ValueError(f"LIDAR_BINS is {bins}; it must be a multiple of {pool}")
@@ -290,13 +290,13 @@ def compiled(
     def empty(state: LoopState) -> LoopState:
         return loop.emptied(state, config)
 
-    begin = jax.jit(sharing.spread(first, (0, axes), mesh))
-    chunk = jax.jit(sharing.spread(onward, (0, axes, None, None), mesh), donate_argnums=0)
-    shapes = sharing.placed(jax.eval_shape(begin, keys, pmdp), mesh)
+    begin = jax.jit(sharing.sharded_vmap(first, (0, axes), mesh))
+    chunk = jax.jit(sharing.sharded_vmap(onward, (0, axes, None, None), mesh), donate_argnums=0)
+    shapes = sharing.sharded_shapes(jax.eval_shape(begin, keys, pmdp), mesh)
     return Programs(
         begin=begin.lower(keys, pmdp).compile(),
         chunk=chunk.lower(shapes, pmdp, config.iterations, config.updates).compile(),
-        emptied=jax.jit(sharing.spread(empty, (0,), mesh)),
+        emptied=jax.jit(sharing.sharded_vmap(empty, (0,), mesh)),
     )
 
 
@@ -313,19 +313,19 @@ def learned(keys: Array, learner: Training, mesh: Mesh | None, checkpoints: Chec
         FloatingPointError: something that was seen or learned is not a finite number.
     """
     config, members = learner.config, learner.members
-    chunks, length = chunks_of(
+    chunks, length = equal_chunks(
         max(1, config.iterations - config.filling - config.opening), training.CHUNKS
     )
     network = loop.make_network(config, learner.pmdp)
     pmdp, axes = side_by_side(learner.pmdp, members)
-    keys, pmdp = sharing.place((keys, pmdp), (0, axes), mesh)
+    keys, pmdp = sharing.shard_arguments((keys, pmdp), (0, axes), mesh)
     learner.on_progress("planning", 0, chunks, "compiling")
     began = time.perf_counter()
     programs = compiled(keys, pmdp, axes, config, mesh)
     compilation = time.perf_counter() - began
 
     def step(i: int, state: LoopState) -> tuple[LoopState, dict[str, Any]]:
-        here = sharing.returned(state, mesh)
+        here = sharing.shard(state, mesh)
         now = learner.during(pmdp, i / chunks)
         state, metrics = programs.chunk(here, now, length, config.updates)
         return state, sharing.gather(metrics, mesh)._asdict()

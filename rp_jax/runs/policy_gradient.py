@@ -20,7 +20,7 @@ from rp_jax import storage
 from rp_jax.baselines import actor_critic, cpo, pid_lagrangian
 from rp_jax.baselines.cpo import CPOConfig
 from rp_jax.baselines.pid_lagrangian import PIDConfig
-from rp_jax.checkpoints import Checkpoints, chunks_of
+from rp_jax.checkpoints import Checkpoints, equal_chunks
 from rp_jax.envs.check import check_contract
 from rp_jax.envs.contract import Env
 from rp_jax.planning.pmdp import PMDP
@@ -197,7 +197,7 @@ def _learned(
     """Trains all policies as one program, chunk by chunk."""
     name, config, pmdp = policies.method, policies.config, policies.pmdp
     learner = LEARNERS[name]
-    chunks, length = chunks_of(-(-steps // config.rollout.steps), training.CHUNKS)
+    chunks, length = equal_chunks(-(-steps // config.rollout.steps), training.CHUNKS)
 
     def chunk(state: Any, pmdp: PMDP, c: Array) -> tuple[Any, dict[str, Array]]:
         def one(state: Any, _: None) -> tuple[Any, dict[str, Array]]:

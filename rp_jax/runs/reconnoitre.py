@@ -143,8 +143,8 @@ def _learned(
             on_progress(f"threat of {kind}: {stage}", done, total, "")
 
         at = checkpoints.at(kind)
-        built[kind] = build.build(own, subs[kind], settings[kind], x, tell, mesh, at)
-    models = sharing.agreed({kind: b.model for kind, b in built.items()})
+        built[kind] = build.learn_threat(own, subs[kind], settings[kind], x, tell, mesh, at)
+    models = sharing.broadcast_first({kind: b.model for kind, b in built.items()})
     reports = {kind: b.report for kind, b in built.items()}
     sums = judged_sums(
         key, env, params, models, settings, x=x, on_progress=on_progress, checkpoints=checkpoints

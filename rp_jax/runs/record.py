@@ -163,7 +163,7 @@ def job(
     except OSError as error:
         raise storage.StorageError(f"{place}: cannot be created ({error.strerror})") from error
     with storage.locked(place, LOCK):
-        storage.sweep(place)
+        storage.remove_partial_files(place)
         file = place / "spec.json"
         if file.exists():
             compared(f"folder is {folder}", read_json(file), wanted)

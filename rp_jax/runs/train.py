@@ -12,7 +12,7 @@ import jax
 
 from rp_jax import devices as sharing
 from rp_jax import storage
-from rp_jax.checkpoints import chunks_of
+from rp_jax.checkpoints import equal_chunks
 from rp_jax.envs.check import check_contract
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.runs import record, saved, training
@@ -266,7 +266,7 @@ def announced(config: TrainConfig, threat: ThreatFunction | None, world: World) 
         world: what they learn in.
     """
     loop = config.planning
-    chunks, length = chunks_of(
+    chunks, length = equal_chunks(
         max(1, loop.iterations - loop.filling - loop.opening), training.CHUNKS
     )
     steps = (loop.opening + loop.filling + chunks * length) * loop.num_envs

@@ -14,13 +14,13 @@ from jax import Array
 from jax.sharding import Mesh
 
 from rp_jax import statistics
-from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints, chunks_of
+from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints, equal_chunks
 from rp_jax.hazards import SubRMDP
 from rp_jax.recon import labels, sampling
 from rp_jax.threat import fit, report
 from rp_jax.threat.fit import Dataset, FitConfig
 from rp_jax.threat.model import ThreatModel
-from rp_jax.validate import finite, leading, number, one_of, random_key
+from rp_jax.validate import finite, number, one_of, random_key, shared_length
 
 Progress = Callable[[str, int, int], None]  # called with (stage, done, total)
 SAMPLINGS = ("uniform", "preferential")
@@ -55,7 +55,7 @@ class ThreatConfig:
         number(f"{name}.fit.validation", self.fit.validation, least=1 / first)
 
 
-class Built(NamedTuple):
+class LearnedThreat(NamedTuple):
     """A threat model and how it was made."""
 
     model: ThreatModel
@@ -121,12 +121,12 @@ def fitted(
     """
     random_key("key", key)
     config.validate("config")
-    leading(features=data.features, threat=data.threat)
+    shared_length(features=data.features, threat=data.threat)
     split_key, init_key = jax.random.split(key)
     train, held = _split(split_key, data, share=config.validation)
     train = fit.mirror(train, sub)
     model, state = _init(init_key, sub, train, config=config)
-    chunks, length = chunks_of(config.steps, CHUNKS)
+    chunks, length = equal_chunks(config.steps, CHUNKS)
     config = dataclasses.replace(config, steps=length * chunks)
 
     def step(i: int, carried: tuple[fit.FitState, np.ndarray]) -> tuple[fit.FitState, np.ndarray]:
@@ -231,7 +231,7 @@ def _thinned(
     return pool, jax.random.bernoulli(keep_key, odds)
 
 
-def build(
+def learn_threat(
     key: Array,
     sub: SubRMDP,
     config: ThreatConfig,
@@ -239,7 +239,7 @@ def build(
     on_progress: Progress | None = None,
     mesh: Mesh | None = None,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
-) -> Built:
+) -> LearnedThreat:
     """Learns the threat function of one kind of hazard.
 
     Args:
@@ -302,4 +302,6 @@ def build(
         "fit": fitted_at - labelled,
         "report": time.perf_counter() - fitted_at,
     }
-    return Built(model, curve, {**found, "x": x, "shift": float(model.shift), **facts}, seconds)
+    return LearnedThreat(
+        model, curve, {**found, "x": x, "shift": float(model.shift), **facts}, seconds
+    )

@@ -34,7 +34,7 @@ class ThreatFunction:
         """
         artefact.save(Path(folder), environment, self.models, self.subs, self.about)
 
-    def fits(self, subs: Mapping[str, SubRMDP], where: str = "threat") -> None:
+    def check_fits(self, subs: Mapping[str, SubRMDP], where: str = "threat") -> None:
         """Raises StorageError unless the function holds for an environment.
 
         Args:

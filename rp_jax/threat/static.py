@@ -51,7 +51,7 @@ def static_threat(clearance: Array) -> Array:
 
     Every value from 1 on is an upper bound of the probability of a hit. The values are graded, so
     that where no plan is clear the one with the greatest clearance is the least threatening; and
-    they are greater than the threat of moving hazards (see `bounded`).
+    they are greater than the threat of moving hazards (see `compress_above_one`).
 
     Args:
         clearance: (...) room units.
@@ -63,7 +63,7 @@ def static_threat(clearance: Array) -> Array:
     return jnp.where(clearance >= MARGIN, 0.0, 2.0 + short)
 
 
-def bounded(total: Array) -> Array:
+def compress_above_one(total: Array) -> Array:
     """Leaves threats up to 1 unchanged, and maps greater ones into (1, 1.5) in the same order.
 
     Args:

@@ -180,7 +180,7 @@ def test_damaged_threats_are_named(refused, tmp_path):
     arrays.write_bytes(data)
     facts = json.loads(manifest.read_text())
     facts["about"]["networks"]["wall"]["hidden"] = [10**9]
-    manifest.write_text(json.dumps({**facts, "seal": storage.seal(facts)}))
+    manifest.write_text(json.dumps({**facts, "seal": storage.manifest_checksum(facts)}))
     refused("circuit", "--threat", "good", says="hidden is [1000000000]", keeps=["good"])
     manifest.write_text("{")
     refused("circuit", "--threat", "good", says="manifest.json: cannot be read", keeps=["good"])

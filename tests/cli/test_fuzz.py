@@ -234,7 +234,7 @@ def test_manifests_of_anything_are_refused(value, tmp_path_factory):
     folder = tmp_path_factory.mktemp("manifest")
     for text in (value, {"format": storage.FORMAT, "kind": "thing", "about": {}, "arrays": value}):
         if isinstance(text, dict):
-            text = {**text, "seal": storage.seal(text)}
+            text = {**text, "seal": storage.manifest_checksum(text)}
         (folder / "manifest.json").write_text(json.dumps(text))
         with pytest.raises(storage.StorageError):
             storage.load(folder, "thing", {"a": 1.0})

@@ -3,7 +3,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rp_jax.dynamics import angle_of, make_vehicle, rotate, squared_distance, to_ego
+from rp_jax.dynamics import angle_of, make_vehicle, rotate, squared_distance, to_body_frame
 
 angles = st.floats(-np.pi, np.pi)
 coordinates = st.floats(-5, 5)
@@ -19,17 +19,17 @@ def test_rotate_turns_to_the_left_and_to_ego_undoes_it(angle, direction, x, y):
     turned = rotate(vector, unit(angle))
     expected = (x + 1j * y) * np.exp(1j * angle)
     np.testing.assert_allclose(turned, [expected.real, expected.imag], atol=1e-5)
-    np.testing.assert_allclose(to_ego(turned, unit(angle)), vector, atol=1e-5)
+    np.testing.assert_allclose(to_body_frame(turned, unit(angle)), vector, atol=1e-5)
     heading = unit(direction)
-    np.testing.assert_allclose(to_ego(heading, heading), [1.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(to_body_frame(heading, heading), [1.0, 0.0], atol=1e-6)
 
 
 def test_the_left_of_the_heading_is_the_positive_y_of_its_frame():
     np.testing.assert_allclose(
-        to_ego(jnp.asarray([0.0, 1.0]), jnp.asarray([0.0, 1.0])), [1.0, 0.0], atol=1e-7
+        to_body_frame(jnp.asarray([0.0, 1.0]), jnp.asarray([0.0, 1.0])), [1.0, 0.0], atol=1e-7
     )
     np.testing.assert_allclose(
-        to_ego(jnp.asarray([-1.0, 0.0]), jnp.asarray([0.0, 1.0])), [0.0, 1.0], atol=1e-7
+        to_body_frame(jnp.asarray([-1.0, 0.0]), jnp.asarray([0.0, 1.0])), [0.0, 1.0], atol=1e-7
     )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rp_jax.dynamics import Vehicle, angle_of, to_ego
+from rp_jax.dynamics import Vehicle, angle_of, to_body_frame
 from rp_jax.envs import circuit
 from rp_jax.envs.sensing import FAR
 from rp_jax.envs.tracks import TrackPlan
@@ -146,7 +146,7 @@ def test_episodes_start_anywhere_on_the_centre_line_within_45_degrees_of_it_at_r
     track = jax.device_get(params.track)
     offset = states.body.position - track.centre[states.index]
     assert np.abs(offset).max() < 0.02  # the nearest centre point, where two coincide
-    angle = np.asarray(angle_of(to_ego(states.body.heading, track.direction[states.index])))
+    angle = np.asarray(angle_of(to_body_frame(states.body.heading, track.direction[states.index])))
     assert np.abs(angle).max() <= np.pi / 4 + 1e-4
     assert stats.kstest(angle, stats.uniform(-np.pi / 4, np.pi / 2).cdf).pvalue > 1e-4
     counts = np.histogram(states.index, bins=np.linspace(0, 1253, 8))[0]

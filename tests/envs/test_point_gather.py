@@ -196,8 +196,8 @@ def test_the_threat_is_equal_to_the_sum_over_bombs(position, x64):
 @pytest.mark.parametrize(
     ("field", "values"),
     [
-        ("n_apples", (-1, 28, 35, 1.5)),
-        ("n_bombs", (0, 34, -2)),
+        ("num_apples", (-1, 28, 35, 1.5)),
+        ("num_bombs", (0, 34, -2)),
         ("time_limit", (0, 1.5)),
         ("horizon", (0, 101)),
         ("beta", (0.0, 1.1)),

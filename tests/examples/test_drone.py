@@ -381,4 +381,4 @@ def test_threats_of_a_world_with_plain_numbers_are_saved_and_found_again(tmp_pat
     ThreatFunction(models, dict(subs)).save(tmp_path, "examples.drone.world")
     found = load_threat(tmp_path, world.sub_rmdps(world.make_params(discs=20)))
     assert list(found.models) == KINDS
-    found.fits(subs)
+    found.check_fits(subs)

@@ -2,7 +2,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rp_jax.planning.nstep import Taken, n_step_transition
+from rp_jax.planning.nstep import WindowStep, n_step_transition
 from rp_jax.planning.percept import Encoded
 
 GAMMA = 0.9
@@ -13,7 +13,7 @@ def window(rewards, terminated, done):
     n = len(rewards)
     seen = lambda names: Encoded(jnp.zeros((n, 1), jnp.uint8), names[:, None])  # noqa: E731
     count = jnp.arange(n, dtype=jnp.float32)
-    return Taken(
+    return WindowStep(
         encoded=seen(count),
         action=jnp.arange(n, dtype=jnp.int32) + 5,
         reward=jnp.asarray(rewards, jnp.float32),

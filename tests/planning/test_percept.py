@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rp_jax.planning.percept import Encoded, encode, faults, not_finite
+from rp_jax.planning.percept import Encoded, encode, non_finite, not_finite
 
 
 def test_bins_where_nothing_is_seen_are_the_farthest():
@@ -41,7 +41,7 @@ def test_bytes_that_hide_a_number_that_is_none_make_the_rest_none():
 def test_faults_are_told_row_by_row_and_apart(none):
     encoded = Encoded(jnp.zeros((3, 2), jnp.uint8), jnp.zeros((3, 2)).at[0, 1].set(none))
     threat = jnp.zeros((3, 4)).at[2, 3].set(none)
-    observations, threats = jax.jit(faults)(encoded, threat)
+    observations, threats = jax.jit(non_finite)(encoded, threat)
     np.testing.assert_array_equal(observations, [True, False, False])
     np.testing.assert_array_equal(threats, [False, False, True])
     np.testing.assert_array_equal(not_finite(threat), threats)

@@ -8,7 +8,7 @@ from rp_jax.dynamics import num_threats
 from rp_jax.envs import circuit, jam
 from rp_jax.planning.pmdp import OUTCOMES, PMDP
 from rp_jax.threat.model import ThreatModel, ThreatNetwork
-from rp_jax.threat.static import bounded, plan_clearance, static_threat
+from rp_jax.threat.static import compress_above_one, plan_clearance, static_threat
 from rp_jax.threat.total import total_threat
 
 PARAMS = probe.make_params()
@@ -115,7 +115,9 @@ def test_under_plans_an_action_is_as_good_as_its_best_plan():
 
     clear = jax.vmap(lambda body: plan_clearance(body, params.body, room))(start.body)
     hazards = jax.vmap(jam.hazards, (0, None))(start, params)
-    moving = bounded(total_threat({"obstacle": model}, start.body, hazards)).reshape(5, 9, 15)
+    moving = compress_above_one(total_threat({"obstacle": model}, start.body, hazards)).reshape(
+        5, 9, 15
+    )
     every = np.asarray(static_threat(clear) + moving)
     np.testing.assert_allclose(found, every.min(axis=1), rtol=1e-5)
     assert (every.argmin(axis=1) > 0).any()  # braking at once is not always best

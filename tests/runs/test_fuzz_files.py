@@ -70,7 +70,7 @@ def forged(path, steps, value):
     else:
         place, key = last
     place[key] = value
-    path.write_text(json.dumps({**manifest, "seal": storage.seal(manifest)}))
+    path.write_text(json.dumps({**manifest, "seal": storage.manifest_checksum(manifest)}))
     return before
 
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints, chunks_of
+from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints, equal_chunks
 from rp_jax.runs import training
 from rp_jax.runs.agents import Member
 
@@ -15,7 +15,7 @@ MEMBERS = [Member(3, 0.1, 0.0), Member(4, 0.1, 0.0)]
 
 @pytest.mark.parametrize("units", [1, 7, 30, 31, 1000])
 def test_chunks_hold_all_units_and_few_more(units):
-    chunks, length = chunks_of(units, training.CHUNKS)
+    chunks, length = equal_chunks(units, training.CHUNKS)
     assert chunks <= training.CHUNKS
     assert units <= chunks * length < units + length
 

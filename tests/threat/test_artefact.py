@@ -56,7 +56,7 @@ def edit(folder, change):
     path = folder / "manifest.json"
     manifest = json.loads(path.read_text())
     change(manifest["about"])
-    manifest["seal"] = storage.seal(manifest)
+    manifest["seal"] = storage.manifest_checksum(manifest)
     path.write_text(json.dumps(manifest))
 
 

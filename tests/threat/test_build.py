@@ -60,7 +60,9 @@ def built(env, kind, way):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(build, "fitted", spy)
-        found = build.build(jax.random.key(0), sub, config, 0.01, lambda *news: told.append(news))
+        found = build.learn_threat(
+            jax.random.key(0), sub, config, 0.01, lambda *news: told.append(news)
+        )
     return sub, found, told
 
 
@@ -126,7 +128,7 @@ def test_preferential_sampling_fits_to_all_that_was_labelled():
 
 def test_the_same_key_builds_the_same_bits():
     sub, found, _ = built(circuit, "wall", "uniform")
-    again = build.build(jax.random.key(0), sub, TINY, 0.01)
+    again = build.learn_threat(jax.random.key(0), sub, TINY, 0.01)
     same = jax.tree.map(lambda a, b: bool((a == b).all()), found.model, again.model)
     assert jax.tree.all(same)
     assert found.curve == again.curve

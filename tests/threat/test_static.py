@@ -10,7 +10,7 @@ import pytest
 from rp_jax import shield
 from rp_jax.dynamics import Vehicle, make_vehicle
 from rp_jax.envs import circuit, jam, tracks
-from rp_jax.threat.static import MARGIN, bounded, plan_clearance, static_threat
+from rp_jax.threat.static import MARGIN, compress_above_one, plan_clearance, static_threat
 
 
 @functools.cache
@@ -81,7 +81,7 @@ def test_threats_of_walls_are_none_or_certain_and_graded():
 
 def test_sums_above_one_keep_their_order_below_a_wall_s_threat():
     total = jnp.asarray([0.0, 0.3, 1.0, 1.2, 3.0, 100.0])
-    found = np.asarray(bounded(total))
+    found = np.asarray(compress_above_one(total))
     np.testing.assert_array_equal(found[:3], total[:3])
     assert (np.diff(found) > 0).all()
     assert found.max() < 1.5

@@ -26,7 +26,7 @@ def test_tuned_models_beat_the_released_ones(name):
     fit = dataclasses.replace(settings.fit, steps=int(SHARES[kind] * settings.fit.steps))
     settings = dataclasses.replace(settings, states=int(SHARES[kind] * settings.states), fit=fit)
     sub = env.sub_rmdps(env.make_params())[kind]
-    model = build.build(jax.random.key(0), sub, settings, x).model
+    model = build.learn_threat(jax.random.key(0), sub, settings, x).model
     found = truth.compare(model, DATA / f"threat_truth_{name}.npz", x)
     error, missed = RELEASED[name]
     assert found["window"]["mae"] < error
