@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,9 +38,10 @@ def main(command: Command, argv: Sequence[str]) -> Path:
         The folder of the results.
     """
     argv, folder = list(argv), experiment.to_resume(argv)
+    module = sys.modules[command.settings.__module__]  # its folder counts as the source of the job
     with errors.bad_input():
         if folder is not None:
-            plain = experiment.interrupted(folder, command.name, None, argv)
+            plain = experiment.interrupted(folder, command.name, module, argv)
             settings: Any = restored(command.settings, plain, str(folder / "config.json"))
             ready = command.prepare(settings)
         else:
@@ -50,7 +52,7 @@ def main(command: Command, argv: Sequence[str]) -> Path:
             out = settings.out or experiment.default_out(command.title(settings))
             folder = storage.new_folder(out)
             facts = {"experiment": command.name, **dataclasses.asdict(settings)}
-            experiment.begin(folder, {**facts, **command.facts(ready), **record.machine(None)})
+            experiment.begin(folder, {**facts, **command.facts(ready), **record.machine(module)})
     again, checkpoints = f"{command.name} --resume {folder}", folder / record.CHECKPOINTS
     with errors.resumable(again, folder, lambda: shutil.rmtree(checkpoints)):
         command.job(settings, ready, folder)

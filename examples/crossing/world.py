@@ -176,7 +176,7 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
         walkers=jax.vmap(walk)(jnp.arange(params.pedestrians), state.walkers),
         time=state.time + 1,
     )
-    hit = collisions(reached, params)
+    hit = contract.hits(sub_rmdps(params), reached.body, hazards(reached, params))
     crashed = hit["pedestrian"] | hit["parked"]
     goal = (reached.body.position[0] > LENGTH) & ~crashed
     way = reached.body.position[0] - state.body.position[0]
@@ -210,13 +210,6 @@ def hazards(state: State, params: Params) -> dict[str, contract.Hazards]:
         "pedestrian": contract.Hazards(state.walkers, jnp.ones(params.pedestrians, bool)),
         "parked": contract.Hazards(jnp.concatenate(sides), jnp.ones(14, bool)),
     }
-
-
-def collisions(state: State, params: Params) -> dict[str, Array]:
-    """Returns whether a pedestrian or a parked car is being hit."""
-    found, subs = hazards(state, params), sub_rmdps(params)
-    hits = {kind: jax.vmap(sub.source.hits, (None, 0)) for kind, sub in subs.items()}
-    return {kind: jnp.any(hits[kind](state.body, found[kind].state)) for kind in subs}
 
 
 def sub_rmdps(params: Params) -> dict[str, SubRMDP]:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from rp_jax.envs.contract import Hazards, Outcome, ended
+from rp_jax.envs.contract import Hazards, Outcome, ended, hits
 from rp_jax.hazards import SubRMDP, Window
 from rp_jax.validate import number
 
@@ -149,8 +149,8 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
     out = moved.position - jnp.clip(moved.position, 0.0, jnp.asarray([FIELD]))
     discs = moved.replace(velocity=moved.velocity * jnp.where(out * moved.velocity > 0, -1, 1))
     new = State(body, {**state.obstacles, "disc": discs}, state.time + 1)
-    hits = [jax.vmap(v.hits, (None, 0))(body, new.obstacles[k]) for k, v in params.sources.items()]
-    crashed = jnp.any(jnp.concatenate(hits))
+    hit = hits(sub_rmdps(params), body, hazards(new, params))
+    crashed = jnp.any(jnp.stack(list(hit.values())))
     left, before = (jnp.linalg.norm(jnp.asarray(GOAL) - b.position) for b in (body, state.body))
     goal = (left < NEAR) & ~crashed
     reward = 10.0 * (before - left) - 0.05 + 5.0 * goal

@@ -214,7 +214,7 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
         carts=jax.vmap(drive)(jnp.arange(params.carts), state.carts),
         time=state.time + 1,
     )
-    crashed = collisions(reached, params)["cart"]
+    crashed = contract.hits(sub_rmdps(params), reached.body, hazards(reached, params))["cart"]
     left = _way_left(reached.body)
     goal = (left < NEAR) & ~crashed
     terminated, truncated = contract.ended(crashed | goal, reached.time, params.time_limit)
@@ -243,12 +243,6 @@ def observe(state: State, params: Params) -> Array:
 def hazards(state: State, params: Params) -> dict[str, contract.Hazards]:
     """All carts."""
     return {"cart": contract.Hazards(state.carts, jnp.ones(params.carts, bool))}
-
-
-def collisions(state: State, params: Params) -> dict[str, Array]:
-    """Whether a cart is being hit."""
-    hits = jax.vmap(params.cart.hits, (None, 0))(state.body, state.carts)
-    return {"cart": jnp.any(hits)}
 
 
 def sub_rmdps(params: Params) -> dict[str, SubRMDP]:

@@ -11,7 +11,7 @@ from rp_jax import storage
 from rp_jax.cli.experiment import world_of
 from rp_jax.runs import saved
 from rp_jax.runs.agents import Agent, Agents
-from rp_jax.runs.record import name_of
+from rp_jax.runs.record import short_name
 from rp_jax.threat import artefact
 from rp_jax.validate import number
 
@@ -95,7 +95,7 @@ def chosen(choice: Choice) -> Chosen:
     if not isinstance(agents, Agents):
         raise ValueError(f"run is {choice.run}; it must have agents, but holds a threat function")
     number("agent", choice.agent, least=0, most=len(agents) - 1, integer=True)
-    variant, settings, name = choice.variant, {}, name_of(agents.pmdp.env).rpartition(".")[2]
+    variant, settings, name = choice.variant, {}, short_name(agents.pmdp.env)
     if (choice.run / "config.json").exists():
         world = world_of(choice.run, agents.pmdp.env)
         name, variant = world.name, variant or next(iter(world.tests), "")

@@ -15,6 +15,7 @@ from rp_jax.cli import errors, experiment
 from rp_jax.cli.choice import parsed_settings
 from rp_jax.cli.experiment import Experiment
 from rp_jax.envs.check import check_contract
+from rp_jax.runs import record
 from rp_jax.runs.saved import imported
 from rp_jax.runs.train import TrainConfig, World
 from rp_jax.threat.build import ThreatConfig
@@ -75,7 +76,7 @@ def world_from(argv: Sequence[str]) -> tuple[World, list[str]]:
         if not colon:
             raise ValueError(f"test is {word!r}; it must be NAME:KEY=VALUE,KEY=VALUE")
         tests[name] = {**settings, **parsed_settings(changes.split(",") if changes else [])}
-    world = World(found.env.rpartition(".")[2], env, settings, tests or {"": dict(settings)})
+    world = World(record.short_name(env), env, settings, tests or {"": dict(settings)})
     for given in (world.settings, *world.tests.values()):
         try:
             env.make_params(**given)

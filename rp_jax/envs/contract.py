@@ -1,7 +1,10 @@
 """The contract of an environment: pure functions on immutable states."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
+import jax
+import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
@@ -107,6 +110,24 @@ class Env(Protocol):
         Args:
             params: the environment's parameters.
         """
+
+
+def hits(
+    sub_rmdps: Mapping[str, SubRMDP], body: Any, hazards: Mapping[str, Hazards]
+) -> dict[str, Array]:
+    """Returns, by kind, whether a hazard is being hit, () bool each.
+
+    Args:
+        sub_rmdps: by kind, what `Env.sub_rmdps` returns.
+        body: state of the body.
+        hazards: by kind, what `Env.hazards` returns.
+    """
+    return {
+        kind: jnp.any(
+            jax.vmap(sub_rmdps[kind].source.hits, (None, 0))(body, group.state) & group.present
+        )
+        for kind, group in hazards.items()
+    }
 
 
 def ended(terminated: Array, time: Array, time_limit: Array) -> tuple[Array, Array]:

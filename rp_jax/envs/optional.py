@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rp_jax.envs.contract import Env
+from rp_jax.envs.contract import Env, hits
 
 
 def num_actions(env: Env, params: Any) -> int:
@@ -31,11 +31,7 @@ def collisions(env: Env, state: Any, params: Any) -> dict[str, Array]:
     """
     if hasattr(env, "collisions"):
         return env.collisions(state, params)
-    subs, found = env.sub_rmdps(params), {}
-    for kind, group in env.hazards(state, params).items():
-        hit = jax.vmap(subs[kind].source.hits, (None, 0))(state.body, group.state)
-        found[kind] = jnp.any(hit & group.present)
-    return found
+    return hits(env.sub_rmdps(params), state.body, env.hazards(state, params))
 
 
 def clearance(env: Env, position: Array, params: Any) -> Array:

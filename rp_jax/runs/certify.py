@@ -13,7 +13,7 @@ from rp_jax.envs.contract import Env
 from rp_jax.runs.agents import Agents, with_member
 from rp_jax.runs.evaluate import ROUND, greedily
 from rp_jax.runs.progress import OnProgress, silent
-from rp_jax.runs.record import name_of
+from rp_jax.runs.record import short_name
 from rp_jax.streams import Stream, key_of
 from rp_jax.validate import number, random_key, shown
 
@@ -122,7 +122,7 @@ def certify(
             break
     shows = crashes <= allowed
     return Certificate(
-        env=name_of(pmdp.env).rpartition(".")[2],
+        env=short_name(pmdp.env),
         method=agents.methods[agent],
         c=c,
         confidence=confidence,

@@ -87,7 +87,7 @@ def evaluate(
     job = {**spec, **record.machine(pmdp.env)} if where is not None else {}
     with record.job(where, stage, job) as checkpoints:
         rows = play_all(key, pmdp, players, episodes, stage, devices, on_progress, checkpoints)
-    about = {"env": record.name_of(pmdp.env).rpartition(".")[2], "variant": name}
+    about = {"env": record.short_name(pmdp.env), "variant": name}
     return Table(scored(rows, pmdp, players, penalty, about))
 
 

@@ -36,7 +36,8 @@ def machine(env: Any) -> dict[str, Any]:
     """Returns what must not change for a job to come to the same bits.
 
     Args:
-        env: the environment; its source counts as well where it is not the library's.
+        env: the environment, or the module of a script; its source counts as well where it is not
+            the library's.
     """
     return {
         "versions": {name: _version(name) for name in LIBRARIES},
@@ -59,6 +60,15 @@ def name_of(env: Any) -> str:
         env: a module, or an object.
     """
     return getattr(env, "__name__", None) or f"{type(env).__module__}.{type(env).__qualname__}"
+
+
+def short_name(env: Any) -> str:
+    """Returns the name of an environment for people: that of `name_of`, without "rp_jax.envs.".
+
+    Args:
+        env: a module, or an object.
+    """
+    return name_of(env).removeprefix("rp_jax.envs.")
 
 
 def source_of(env: Any) -> Path | None:

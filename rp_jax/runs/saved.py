@@ -76,7 +76,7 @@ def load(folder: str | Path, env: Env | None = None, params: Any = None) -> Any:
     folder = Path(folder)
     alone = (folder / "manifest.json").exists()
     about = artefact.about(folder) if alone else about_agents(folder)
-    world = imported(about.get("env") or about.get("environment")) if env is None else env
+    world = _world(about) if env is None else env
     if alone:
         found = params if params is not None else _made(world, {}, folder)
         return load_threat(folder, world.sub_rmdps(found))
@@ -120,9 +120,17 @@ def imported(name: Any) -> Any:
         return importlib.import_module(str(name))
     except ImportError as error:
         raise storage.StorageError(
-            f"env is {name!r}, which cannot be imported ({error}); it must be given: load(folder, "
-            "env=...)"
+            f"env is {name!r}, which cannot be imported ({error}); it must be a module, such as "
+            "rp_jax.envs.jam"
         ) from error
+
+
+def _world(about: Mapping[str, Any]) -> Any:
+    """Returns the environment that the facts of a file name."""
+    try:
+        return imported(about.get("env") or about.get("environment"))
+    except storage.StorageError as error:
+        raise storage.StorageError(f"{error}; or give it: load(folder, env=...)") from error
 
 
 def _made(env: Any, settings: Mapping[str, Any], where: Path) -> Any:

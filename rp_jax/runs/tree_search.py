@@ -76,7 +76,7 @@ def evaluate_search(
             alone = time_search(key, search)
             rows.append(
                 {
-                    "env": record.name_of(search.model).rpartition(".")[2],
+                    "env": record.short_name(search.model),
                     "variant": test,
                     "method": method_name(search),
                     "seed": 0,

@@ -100,7 +100,7 @@ def test_an_interrupted_comparison_goes_on_with_the_methods_that_are_left(tmp_pa
 def test_settings_come_back_from_the_file(tmp_path, monkeypatch):
     config = compare.Config("jam", methods=("PID",), steps=6000, out=tmp_path)
     facts = {"experiment": compare.COMMAND.name, **dataclasses.asdict(config)}
-    experiment.begin(tmp_path, {**facts, **record.machine(None)})
+    experiment.begin(tmp_path, {**facts, **record.machine(compare)})
     went_on = []
     command = compare.COMMAND._replace(job=lambda *of: went_on.append(of))
     compare.main(command, ["--resume", str(tmp_path)])
