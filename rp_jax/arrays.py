@@ -19,6 +19,17 @@ def select(condition: Array, yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
+def zeros_like(shape: jax.ShapeDtypeStruct | Array) -> Array:
+    """Returns zeros of a shape and type; keys are that of seed 0.
+
+    Args:
+        shape: an array, or its shape and type.
+    """
+    if jax.dtypes.issubdtype(shape.dtype, jax.dtypes.prng_key):
+        return jnp.broadcast_to(jax.random.key(0), shape.shape)
+    return jnp.zeros(shape.shape, shape.dtype)
+
+
 def ranks(values: Array) -> Array:
     """Returns each value's place in ascending order.
 

@@ -174,7 +174,19 @@ def masked_sample(key: Array, admissible: Array) -> Array:
     """
     random_key("key", key)
     ranked(1, admissible=admissible)
+    return masked_choice(jax.random.uniform(key), admissible)
+
+
+def masked_choice(uniform: Array, admissible: Array) -> Array:
+    """Returns the admissible action that a random number falls on, all equally likely.
+
+    Args:
+        uniform: () random number, uniform on [0, 1).
+        admissible: (A,) bool.
+
+    Returns:
+        () int, the action's index.
+    """
     rank = jnp.cumsum(admissible)
-    uniform = jax.random.uniform(key)
     chosen = jnp.minimum(jnp.floor(uniform * rank[-1]), rank[-1] - 1)
     return jnp.argmax(rank > chosen)

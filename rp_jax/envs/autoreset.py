@@ -17,6 +17,8 @@ def step_and_renew(
     actions: Array,
     params: Any,
     look: Callable[[Any], Any],
+    *,
+    restart: Array | None = None,
 ) -> tuple[tuple[Any, Any], tuple[Any, Any], Outcome]:
     """Makes a step of a batch, restarts ended episodes, and looks at all states.
 
@@ -29,6 +31,7 @@ def step_and_renew(
         actions: (B,) int, or (B, D) float where they are continuous.
         params: the environment's parameters, unbatched.
         look: maps a batch of states, of any size, to a pytree with a row for each.
+        restart: () bool, whether all episodes end with this step, whatever it leads to.
 
     Returns:
         (carried, reached, outcome), leading axes (B,). `carried` holds the states to continue from,
@@ -38,6 +41,9 @@ def step_and_renew(
     both = jax.vmap(jax.random.split)(keys)
     step = jax.vmap(env.step, (0, 0, 0, None))
     reached, outcome = step(both[:, 0], states, actions, params)
+    if restart is not None:
+        terminated, truncated = outcome.terminated | restart, outcome.truncated & ~restart
+        outcome = outcome.replace(terminated=terminated, truncated=truncated)
 
     def starts(rows: Array) -> Any:
         fresh = jax.vmap(env.reset, (0, None))(both.at[rows, 1].get(mode="clip"), params)

@@ -11,6 +11,7 @@ from flax import linen as nn
 from jax import Array
 
 from rp_jax import shield
+from rp_jax.arrays import zeros_like
 from rp_jax.envs import autoreset, optional, tally
 from rp_jax.planning import dqn
 from rp_jax.planning.dqn import DQNConfig, Learner, Transition
@@ -66,13 +67,18 @@ class LoopConfig:
 
     @property
     def opening(self) -> int:
-        """Iterations that fill the windows, before anything is kept in the replay."""
-        return self.n_step - 1
+        """Iterations before anything is kept: one draws the starts, others fill the windows."""
+        return self.n_step
 
     @property
     def filling(self) -> int:
         """Iterations that fill the replay before learning begins."""
         return -(-self.replay_start // self.num_envs)
+
+    @property
+    def learning(self) -> int:
+        """Iterations of acting and learning, once the replay is filled."""
+        return max(1, self.iterations - self.filling - self.opening + 1)
 
     @property
     def samples_per_step(self) -> float:
@@ -162,17 +168,16 @@ def exploration(iteration: Array, config: LoopConfig) -> Array:
 
 def _choose(key: Array, values: Array, admissible: Array, epsilon: Array) -> Array:
     """() int32, epsilon-greedy inside the admissible set."""
-    explore, pick = jax.random.split(key)
+    explore, pick = jax.random.uniform(key, (2,))
     greedy = shield.masked_argmax(values, admissible)
-    random = shield.masked_sample(pick, admissible)
-    action = jnp.where(jax.random.bernoulli(explore, epsilon), random, greedy)
-    return action.astype(jnp.int32)
+    random = shield.masked_choice(pick, admissible)
+    return jnp.where(explore < epsilon, random, greedy).astype(jnp.int32)
 
 
 def interact(
     key: Array, state: LoopState, pmdp: PMDP, network: nn.Module, config: LoopConfig
 ) -> tuple[LoopState, LoopMetrics]:
-    """Takes one step of every environment, and learns nothing.
+    """Takes one step of every environment, and learns nothing; the first call draws the starts.
 
     Args:
         key: of the actions and the environments.
@@ -185,7 +190,7 @@ def interact(
         The state with its windows moved on by a step, and the metrics of the step.
     """
     choose_key, step_key = jax.random.split(key)
-    batch = config.num_envs
+    batch, starting = config.num_envs, state.iteration < 1 - config.opening
     values = jnp.asarray(network.apply(state.learner.params, state.seen.encoded))
     epsilon = exploration(state.iteration, config)
     keys = jax.random.split(choose_key, batch)
@@ -197,12 +202,14 @@ def interact(
         action,
         pmdp.params,
         pmdp.perceive,
+        restart=starting,
     )
     insecure = ~seen.secure & ~outcome.terminated
+    reward = outcome.reward - pmdp.penalty * outcome.danger - pmdp.insecure_penalty * insecure
     taken = WindowStep(
         encoded=state.seen.encoded,
         action=action,
-        reward=outcome.reward - pmdp.penalty * outcome.danger - pmdp.insecure_penalty * insecure,
+        reward=jnp.where(starting, 0.0, reward),
         terminated=outcome.terminated,
         done=outcome.done,
         next_encoded=seen.encoded,
@@ -221,6 +228,7 @@ def interact(
         bad_threats=jnp.sum(bad_threat, dtype=dtype),
         bad_rewards=jnp.sum(~jnp.isfinite(taken.reward), dtype=dtype),
     )
+    metrics = jax.tree.map(lambda count: jnp.where(starting, 0.0, count), metrics)
     window = jax.tree.map(
         lambda old, new: jnp.concatenate([old[1:], new[None]]), state.window, taken
     )
@@ -237,7 +245,10 @@ def _inadmissible(seen: Percept, action: Array) -> Array:
 
 
 def begin(key: Array, pmdp: PMDP, config: LoopConfig) -> LoopState:
-    """Returns all environments at a start, a fresh learner, and nothing in the replay.
+    """Returns a fresh learner, and nothing in the replay; the first iteration draws the starts.
+
+    The environments' states, and what is seen of them, are zeros until then, so that nothing of the
+    environment is compiled here.
 
     Args:
         key: of everything random in training.
@@ -249,12 +260,16 @@ def begin(key: Array, pmdp: PMDP, config: LoopConfig) -> LoopState:
     """
     config.validate("config")
     random_key("key", key)
-    reset_key, net_key, key = jax.random.split(key, 3)
+    net_key, key = jax.random.split(key)
     batch = config.num_envs
     network, replay = make_network(config, pmdp), make_replay(config)
-    resets = jax.random.split(reset_key, batch)
-    states = jax.vmap(pmdp.env.reset, (0, None))(resets, pmdp.params)
-    seen = pmdp.perceive(states)
+
+    def starts(key: Array) -> tuple[Any, Percept]:
+        resets = jax.random.split(key, batch)
+        states = jax.vmap(pmdp.env.reset, (0, None))(resets, pmdp.params)
+        return states, pmdp.perceive(states)
+
+    states, seen = jax.tree.map(zeros_like, jax.eval_shape(starts, key))
     encoded, admissible, _, threat, _ = seen
     zeros = jnp.zeros(batch, threat.dtype)
     false = jnp.zeros(batch, bool)
@@ -271,7 +286,7 @@ def begin(key: Array, pmdp: PMDP, config: LoopConfig) -> LoopState:
         learner=dqn.init(net_key, network, make_optimiser(config), encoded),
         replay=replay.init(jax.tree.map(lambda a: a[0], example)),
         key=key,
-        iteration=jnp.asarray(1 - config.n_step, jnp.int32),
+        iteration=jnp.asarray(-config.opening, jnp.int32),
     )
 
 
@@ -283,12 +298,10 @@ def init(key: Array, pmdp: PMDP, config: LoopConfig) -> tuple[LoopState, LoopMet
         pmdp: the environment, the threats and the threshold.
         config: of the loop.
     """
-    state, opening = begin(key, pmdp, config), None
-    if config.opening:
-        state, opening = chunk(state, pmdp, config, config.opening, updates=0)
-        state = emptied(state, config)
-    state, metrics = chunk(state, pmdp, config, config.filling, updates=0)
-    return state, metrics if opening is None else jax.tree.map(jnp.add, opening, metrics)
+    state = begin(key, pmdp, config)
+    state, opening = chunk(state, pmdp, config, config.opening, updates=0)
+    state, metrics = chunk(emptied(state, config), pmdp, config, config.filling, updates=0)
+    return state, jax.tree.map(jnp.add, opening, metrics)
 
 
 def emptied(state: LoopState, config: LoopConfig) -> LoopState:

@@ -313,9 +313,7 @@ def learned(keys: Array, learner: Training, mesh: Mesh | None, checkpoints: Chec
         FloatingPointError: something that was seen or learned is not a finite number.
     """
     config, members = learner.config, learner.members
-    chunks, length = equal_chunks(
-        max(1, config.iterations - config.filling - config.opening), training.CHUNKS
-    )
+    chunks, length = equal_chunks(config.learning, training.CHUNKS)
     network = loop.make_network(config, learner.pmdp)
     pmdp, axes = side_by_side(learner.pmdp, members)
     keys, pmdp = sharing.shard_arguments((keys, pmdp), (0, axes), mesh)
@@ -371,10 +369,7 @@ def _filled(
     programs: Programs, keys: Array, pmdp: PMDP, config: LoopConfig
 ) -> tuple[LoopState, loop.LoopMetrics]:
     """As `loop.init`, by compiled programs."""
-    state = programs.begin(keys, pmdp)
-    if not config.opening:
-        return programs.chunk(state, pmdp, config.filling, 0)
-    state, opening = programs.chunk(state, pmdp, config.opening, 0)
+    state, opening = programs.chunk(programs.begin(keys, pmdp), pmdp, config.opening, 0)
     state, filled = programs.chunk(programs.emptied(state), pmdp, config.filling, 0)
     return state, jax.tree.map(jnp.add, opening, filled)
 

@@ -266,10 +266,8 @@ def announced(config: TrainConfig, threat: ThreatFunction | None, world: World) 
         world: what they learn in.
     """
     loop = config.planning
-    chunks, length = equal_chunks(
-        max(1, loop.iterations - loop.filling - loop.opening), training.CHUNKS
-    )
-    steps = (loop.opening + loop.filling + chunks * length) * loop.num_envs
+    chunks, length = equal_chunks(loop.learning, training.CHUNKS)
+    steps = (loop.opening - 1 + loop.filling + chunks * length) * loop.num_envs
     shield = "no shield" if threat is None else f"x = {config.x:g}"
     return (
         f"planning in {world.name}: {config.seeds} x {steps:,} steps, {loop.samples_per_step:g} "

@@ -215,9 +215,9 @@ def test_one_program_fills_the_replay_and_then_learns(compile_soon):
     pmdp = probe.make_pmdp(probe, PARAMS)
     program = jax.jit(functools.partial(loop.chunk, pmdp=pmdp, config=CONFIG))
     begun = jax.jit(loop.begin, static_argnums=2)(jax.random.key(4), pmdp, CONFIG)
-    assert (begun.iteration, begun.replay.current_index) == (-1, 0)
+    assert (begun.iteration, begun.replay.current_index) == (-2, 0)
     early, opening = program(begun, iterations=CONFIG.opening, updates=0)
-    early = loop.emptied(early, CONFIG)  # the windows hold one step of two
+    early = loop.emptied(early, CONFIG)  # the windows hold one step of two, after the starts
     assert (early.iteration, early.replay.current_index) == (0, 0)
     state, metrics = program(early, iterations=CONFIG.filling, updates=0)
     assert (state.iteration, state.replay.current_index) == (10, 320)
@@ -310,7 +310,7 @@ def test_nothing_of_half_filled_windows_is_in_the_replay(prioritised, monkeypatc
     always = lambda *_: jnp.asarray(probe.RIGHT, jnp.int32)  # noqa: E731
     monkeypatch.setattr(loop, "_choose", always)
     config = dataclasses.replace(CONFIG, n_step=3, replay_start=64, prioritised=prioritised)
-    assert (config.opening, config.filling) == (2, 2)
+    assert (config.opening, config.filling) == (3, 2)
     pmdp = probe.make_pmdp(probe, probe.make_params(slip=0.0), 0.5, penalty=1.0)
     state, metrics = jax.jit(lambda key: loop.init(key, pmdp, config))(jax.random.key(12))
     assert (state.iteration, metrics.steps) == (2, 4 * 32)
