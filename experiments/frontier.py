@@ -13,8 +13,6 @@ from dataclasses import dataclass
 from experiments import jam
 from rp_jax.cli import experiment, frontier_command
 from rp_jax.cli.experiment import Experiment
-from rp_jax.runs.frontier import check_thresholds
-from rp_jax.validate import number
 
 
 @dataclass(frozen=True)
@@ -26,8 +24,7 @@ class Config(jam.Config):
     def validate(self) -> None:
         """Raises ValueError, naming the field, if a value is out of range."""
         super().validate()
-        number("x", self.x, above=0, most=1)
-        check_thresholds(self.thresholds)
+        frontier_command.check(self)
 
 
 def quick(recipe: str) -> Config:

@@ -38,7 +38,7 @@ def main(command: Command, argv: Sequence[str]) -> Path:
         The folder of the results.
     """
     argv, folder = list(argv), experiment.to_resume(argv)
-    module = sys.modules[command.settings.__module__]  # its folder counts as the source of the job
+    module = sys.modules[command.settings.__module__]  # its source counts as that of the job
     with errors.bad_input():
         if folder is not None:
             plain = experiment.interrupted(folder, command.name, module, argv)

@@ -49,11 +49,15 @@ def mesh_of(devices: str) -> Mesh | None:
     """Returns a mesh of all devices of all connected processes in a line.
 
     Args:
-        devices: one of `DEVICES`.
+        devices: one of `DEVICES`; "cluster" joins the other processes, unless they are joined.
 
     Returns:
         The mesh, with the single axis `ROWS`; None for "one".
+
+    Raises:
+        ValueError: no cluster is found, or it does not answer.
     """
+    connect(devices)
     if devices == "one":
         return None
     return jax.make_mesh((jax.device_count(),), (ROWS,), axis_types=(AxisType.Auto,))

@@ -2,14 +2,15 @@
 
 import dataclasses
 
-from rp_jax.hazards import SubRMDP, is_static
+from rp_jax.hazards import SubRMDP
 from rp_jax.planning.dqn import DQNConfig
 from rp_jax.planning.loop import LoopConfig
+from rp_jax.recon.labels import is_enumerable
 from rp_jax.threat.build import ThreatConfig
 from rp_jax.threat.fit import FitConfig
 
-TUNED_OBSTACLE = ThreatConfig()  # of hazards that move
-TUNED_WALL = ThreatConfig(  # of hazards that stay, whose labels are exact
+TUNED_OBSTACLE = ThreatConfig()  # of all others
+TUNED_WALL = ThreatConfig(  # of hazards that stay, whose threats are enumerated
     states=150_000,
     sampling="uniform",
     miss_rate=1.0,
@@ -29,9 +30,9 @@ def tuned(sub: SubRMDP) -> ThreatConfig:
     """Returns settings for the threat function of one kind of hazard.
 
     Args:
-        sub: the sub-R-MDP; hazards that stay where they are need no rollouts and small networks.
+        sub: the sub-R-MDP; where its threats are enumerated, a small network learns them.
     """
-    return TUNED_WALL if is_static(sub.source) else TUNED_OBSTACLE
+    return TUNED_WALL if is_enumerable(sub) else TUNED_OBSTACLE
 
 
 # Appendix G.1: 100,000 states and their mirror images, 20 and 25 epochs of batches of 512. The

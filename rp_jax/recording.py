@@ -24,6 +24,7 @@ class Recording(NamedTuple):
     admissible: Array  # (time, episode, A)
     secure: Array
     alive: Array  # bool, the episode had not ended before this step
+    danger: Array  # of this step; 0 after an end
 
 
 def record(
@@ -47,7 +48,13 @@ def record(
     def shown(step: Step) -> Recording:
         seen = step.percept
         return Recording(
-            step.states, step.action, seen.threat, seen.admissible, seen.secure, step.alive
+            step.states,
+            step.action,
+            seen.threat,
+            seen.admissible,
+            seen.secure,
+            step.alive,
+            jnp.where(step.alive, step.outcome.danger, 0),
         )
 
     def fold(tape: Recording, step: Step) -> Recording:
@@ -57,7 +64,8 @@ def record(
         percept = pmdp.perceive(starts)
         action, _ = policy(key, percept)
         alive = jnp.ones(percept.secure.shape, bool)
-        return Recording(starts, action, percept.threat, percept.admissible, percept.secure, alive)
+        seen = (percept.threat, percept.admissible, percept.secure)
+        return Recording(starts, action, *seen, alive, jnp.zeros(alive.shape))
 
     blank = jax.tree.map(
         lambda a: jnp.zeros((steps, *a.shape), a.dtype), jax.eval_shape(first, starts)

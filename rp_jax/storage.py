@@ -199,10 +199,13 @@ def statics(part: Any, path: str = "") -> dict[str, Any]:
     """Returns the fields of a tree of dataclasses that hold no arrays, by path.
 
     Args:
-        part: a tree of flax's dataclasses, such as the parameters of an environment.
+        part: a tree of flax's dataclasses, tables, lists and tuples, such as the parameters of an
+            environment.
         path: prefix of the paths.
     """
     found: dict[str, Any] = {}
+    if isinstance(part, list | tuple):
+        part = dict(enumerate(part))
     if isinstance(part, Mapping):
         for name, value in part.items():
             found |= statics(value, f"{path}{name}/")
@@ -213,6 +216,24 @@ def statics(part: Any, path: str = "") -> dict[str, Any]:
         else:
             found[name] = value
     return found
+
+
+def text(value: Any) -> str:
+    """Returns the text of a static value, the same in every process.
+
+    Args:
+        value: anything. A function is named by its module and name. An object whose text would say
+            where it is in memory is told by its class and its fields.
+    """
+    if isinstance(value, list | tuple):
+        return f"({', '.join(map(text, value))})"
+    found = str(value)
+    if " at 0x" not in found:
+        return found
+    if hasattr(value, "__qualname__"):
+        return f"{value.__module__}.{value.__qualname__}"
+    fields = {name: text(part) for name, part in sorted(getattr(value, "__dict__", {}).items())}
+    return f"{type(value).__module__}.{type(value).__qualname__}{fields}"
 
 
 def _flat(tree: Any) -> dict[str, Any]:
@@ -267,6 +288,28 @@ def manifest_checksum(manifest: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(rest).encode()).hexdigest()
 
 
+def checksum(tree: Any) -> str:
+    """Returns the SHA-256 that `save` would state of the arrays of a pytree.
+
+    Args:
+        tree: any pytree of arrays and random keys.
+    """
+    return _checksum(_raw(leaves(tree)))
+
+
+def _raw(arrays: Mapping[str, np.ndarray]) -> list[memoryview]:
+    """Returns the bytes of arrays."""
+    return [a.reshape(-1).view(np.uint8).data for a in arrays.values()]
+
+
+def _checksum(raw: list[memoryview]) -> str:
+    """Returns the SHA-256 of parts, one after another."""
+    digest = hashlib.sha256()
+    for part in raw:
+        digest.update(part)
+    return digest.hexdigest()
+
+
 def save(folder: Path, kind: str, tree: Any, about: Mapping[str, Any]) -> None:
     """Saves the arrays of a pytree, with a manifest from which they can be read and checked.
 
@@ -290,15 +333,12 @@ def save(folder: Path, kind: str, tree: Any, about: Mapping[str, Any]) -> None:
     except OSError as error:
         raise StorageError(f"{folder}: cannot be created ({error.strerror})") from error
     arrays = leaves(tree)
-    raw = [a.reshape(-1).view(np.uint8).data for a in arrays.values()]
-    digest = hashlib.sha256()
-    for part in raw:
-        digest.update(part)
+    raw = _raw(arrays)
     manifest = plain(
         {
             "format": FORMAT,
             "kind": kind,
-            "sha256": digest.hexdigest(),
+            "sha256": _checksum(raw),
             "bytes": sum(len(part) for part in raw),
             "arrays": {name: _facts(a) for name, a in arrays.items()},
             "versions": {"jax": jax.__version__, "numpy": np.__version__},

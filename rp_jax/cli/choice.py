@@ -95,13 +95,13 @@ def chosen(choice: Choice) -> Chosen:
     if not isinstance(agents, Agents):
         raise ValueError(f"run is {choice.run}; it must have agents, but holds a threat function")
     number("agent", choice.agent, least=0, most=len(agents) - 1, integer=True)
-    variant, settings, name = choice.variant, {}, short_name(agents.pmdp.env)
+    variant, name = choice.variant, short_name(agents.pmdp.env)
     if (choice.run / "config.json").exists():
         world = world_of(choice.run, agents.pmdp.env)
         name, variant = world.name, variant or next(iter(world.tests), "")
         if variant:
             world.params(variant)
-            settings = world.tests[variant]
+        settings = world.tests.get(variant, world.settings)
     elif variant:
         raise ValueError(f"variant is {variant!r}; {choice.run} has no tests: use --set")
     else:
@@ -113,12 +113,7 @@ def chosen(choice: Choice) -> Chosen:
             params = world_env.make_params(**{**settings, **changes})
         except TypeError as error:
             raise ValueError(f"set is {choice.set}; it must fit make_params ({error})") from error
-        if agents.threat is not None:
-            agents.threat.check_fits(agents.pmdp.env.sub_rmdps(params))
-        pmdp = agents.pmdp.replace(params=params)
-        agents = Agents(
-            pmdp, agents.network, agents.weights, agents.members, agents.config, agents.threat
-        )
+        agents = agents.in_world(params=params)
     label = " ".join([variant, *choice.set]).strip()
     return Chosen(agents, name, label, identity(choice.run))
 

@@ -18,9 +18,22 @@ from rp_jax.cli.experiment import Experiment, Run
 from rp_jax.runs import frontier, tables
 from rp_jax.runs.progress import OnProgress
 from rp_jax.runs.train import World, threat_of
-from rp_jax.validate import number
+from rp_jax.validate import number, one_of
 
 THRESHOLDS = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
+
+
+def check(config: Any) -> None:
+    """Raises ValueError, naming it, if a setting has no place in the comparison.
+
+    To be called before any work, where a run's world is made.
+
+    Args:
+        config: with finite thresholds, and a shield.
+    """
+    number("x", config.x, above=0, most=1)  # the threat function is learned for it
+    frontier.check_thresholds(config.thresholds)
+    one_of("shield", config.shield, [True])
 
 
 def job(run: Run, bar: OnProgress) -> None:
@@ -31,8 +44,7 @@ def job(run: Run, bar: OnProgress) -> None:
         bar: of the progress.
     """
     config: Any = run.config
-    number("x", config.x, above=0, most=1)
-    frontier.check_thresholds(config.thresholds)
+    check(config)
     key, params = jax.random.key(0), run.world.params()
     threat = threat_of(key, run.world, config, run.threats, run.folder, run.process, bar)
     rows = frontier.frontier(
@@ -45,6 +57,9 @@ def job(run: Run, bar: OnProgress) -> None:
         seeds=list(range(config.seed, config.seed + config.seeds)),
         config=config.planning,
         lookahead=config.lookahead,
+        learning_penalty=config.learning_penalty,
+        learning_penalty_from=config.learning_penalty_from,
+        insecure_penalty=config.insecure_penalty,
         episodes=config.episodes,
         penalty=config.penalty,
         folder=run.folder,
@@ -95,12 +110,17 @@ def main(argv: Sequence[str]) -> None:
         bases=(type(base),),
         frozen=True,
     )
+
+    def checked_world(config: Any) -> World:
+        check(config)
+        return cast(World, world)
+
     experiment.run(
         Experiment(
             name="rp-jax frontier",
             about=f"{__doc__}\n{train_command.WORLDS}",
             presets={"default": lambda recipe: kind()},
-            make_world=lambda config: cast(World, world),
+            make_world=checked_world,
             job=job,
             recipes=("tuned",),
         ),

@@ -52,6 +52,8 @@ def job(run: Run, bar: OnProgress) -> None:
         tests={name: run.world.params(name) for name in run.world.tests},
         seeds=list(range(config.seed, config.seed + config.seeds)),
         config=config.planning,
+        lookahead=config.lookahead,
+        insecure_penalty=config.insecure_penalty,
         episodes=config.episodes,
         folder=run.folder,
         settings=run.world.settings,

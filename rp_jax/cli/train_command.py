@@ -62,7 +62,7 @@ def world_from(argv: Sequence[str]) -> tuple[World, list[str]]:
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--env", required=True)
-    parser.add_argument("--set", nargs="*", default=[])
+    parser.add_argument("--set", nargs="*", action="extend", default=[])
     parser.add_argument("--test", nargs="*", action="extend", default=[])
     if not _names_env(argv):
         raise ValueError("env is missing; it must be a module, such as --env my_package.world")

@@ -65,6 +65,10 @@ class Env(Protocol):
         make_params(**settings)       parameters from settings, so that saved agents can be
                                       loaded by the environment's name alone
         without_moving_hazards(state) the state without moving hazards, for model predictive control
+        mixed_start(key, start, fresh)  a start state with some parts of `start` and the others of
+                                      `fresh`, both drawn by `reset`, such that `reset` may draw it
+                                      too: the search for starts of rare crashes tries them; by
+                                      default one of the two
     """
 
     def reset(self, key: Array, params: Any) -> Any:

@@ -20,7 +20,7 @@ from rp_jax.dynamics import (
     squared_distance,
     to_body_frame,
 )
-from rp_jax.envs import contract, sensing
+from rp_jax.envs import contract, optional, sensing
 from rp_jax.envs.walls import FARTHEST, least_radius
 from rp_jax.hazards import MovingObstacle, SubRMDP, WallPoint
 from rp_jax.validate import number, one_of, positive
@@ -375,6 +375,21 @@ def without_moving_hazards(state: State) -> State:
     """
     one = jax.tree.map(lambda a: a[:1], state.obstacles)
     return state.replace(obstacles=one, present=jnp.zeros(1, bool))
+
+
+def mixed_start(key: Array, start: State, fresh: State) -> State:
+    """Returns a start state with some of its obstacles taken from another.
+
+    Args:
+        key: random key.
+        start: a start state.
+        fresh: another one, with as many obstacles.
+    """
+    taken = jax.random.bernoulli(key, optional.RENEWED, start.present.shape)
+    obstacles, present = jax.vmap(arrays.select)(
+        taken, (fresh.obstacles, fresh.present), (start.obstacles, start.present)
+    )
+    return start.replace(obstacles=obstacles, present=present)
 
 
 def _seen_obstacles(state: State) -> Array:

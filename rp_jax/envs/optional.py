@@ -6,7 +6,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from rp_jax.arrays import select
 from rp_jax.envs.contract import Env, hits
+
+RENEWED = 0.2  # probability that a part of a start is taken from another
 
 
 def num_actions(env: Env, params: Any) -> int:
@@ -56,6 +59,21 @@ def threshold(env: Env, state: Any, x: Array) -> Array:
         x: () the threshold of environments that do not say.
     """
     return env.threshold(state) if hasattr(env, "threshold") else jnp.asarray(x)
+
+
+def mixed_start(env: Env, key: Array, start: Any, fresh: Any) -> Any:
+    """Returns a start state like a given one, with some parts taken from another.
+
+    Args:
+        env: the environment; by default all of the start is taken from the other, with probability
+            `RENEWED`, or nothing.
+        key: random key.
+        start: a start state.
+        fresh: another one.
+    """
+    if hasattr(env, "mixed_start"):
+        return env.mixed_start(key, start, fresh)
+    return select(jax.random.bernoulli(key, RENEWED), fresh, start)
 
 
 def lidar_bins(env: Env) -> int:

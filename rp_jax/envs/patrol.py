@@ -15,6 +15,7 @@ from rp_jax.envs.jam import (  # noqa: F401
     collisions,
     hazards,
     make_params,
+    mixed_start,
     num_actions,
     sub_rmdps,
     without_moving_hazards,

@@ -221,8 +221,7 @@ def leaves(sub: SubRMDP) -> int:
 def best_estimator(sub: SubRMDP, paths: int, exact: bool = True) -> Estimator:
     """Returns the exact estimator where it is affordable, and a sampling one elsewhere.
 
-    The exact one is affordable for hazards that do not move and trees of at most `MOST_LEAVES`
-    leaves.
+    The exact one is affordable where `is_enumerable` says so.
 
     Args:
         sub: the sub-R-MDP.
@@ -235,10 +234,20 @@ def best_estimator(sub: SubRMDP, paths: int, exact: bool = True) -> Estimator:
     number("paths", paths, least=1, integer=True)
     if isinstance(sub.body.baseline, Plans):
         return _sampled(plan_threat, paths)
-    enumerable = exact and isinstance(sub.body.baseline, ControlDistribution)
-    if enumerable and is_static(sub.source) and leaves(sub) <= MOST_LEAVES:
-        return exact_threat
-    return _sampled(monte_carlo_threat, paths)
+    return exact_threat if exact and is_enumerable(sub) else _sampled(monte_carlo_threat, paths)
+
+
+def is_enumerable(sub: SubRMDP) -> bool:
+    """Returns whether the threats of a sub-R-MDP are found by enumeration, without rollouts.
+
+    They are for hazards that do not move, a baseline policy that draws from a table, and trees of
+    at most `MOST_LEAVES` leaves.
+
+    Args:
+        sub: the sub-R-MDP.
+    """
+    listed = isinstance(sub.body.baseline, ControlDistribution)
+    return listed and is_static(sub.source) and leaves(sub) <= MOST_LEAVES
 
 
 @functools.cache

@@ -16,7 +16,7 @@ from rp_jax.runs.evaluate import evaluate
 from rp_jax.runs.plan import make_pmdp, plan
 from rp_jax.runs.progress import OnMetrics, OnProgress, silent
 from rp_jax.runs.tables import Table
-from rp_jax.streams import Stream, key_of
+from rp_jax.streams import Stream, key_of, numbered
 from rp_jax.threat.function import ThreatFunction
 from rp_jax.validate import number
 
@@ -32,6 +32,8 @@ def compare_shields(
     tests: Mapping[str, Any],
     seeds: int | Sequence[int] = 1,
     config: LoopConfig | None = None,
+    lookahead: int = 0,
+    insecure_penalty: float = 0.0,
     episodes: int = 10_000,
     folder: Path | None = None,
     settings: Mapping[str, Any] | None = None,
@@ -51,6 +53,8 @@ def compare_shields(
         tests: by name, parameters while testing.
         seeds: how many agents of each kind, or their numbers.
         config: of the learner.
+        lookahead: of the shield, as in `plan`.
+        insecure_penalty: of those that learn behind the shield, as in `plan`.
         episodes: evaluated per test and agent.
         folder: for curves, agents and checkpoints.
         settings: keywords of `env.make_params` that made the parameters.
@@ -78,11 +82,30 @@ def compare_shields(
     free = plan(
         key, env, params, learning_penalty=(0.0, penalty), folder=place("unshielded"), **common
     )
-    held = plan(key, env, params, threat, x=x, folder=folder, **common)
+    held = plan(
+        key,
+        env,
+        params,
+        threat,
+        x=x,
+        lookahead=lookahead,
+        insecure_penalty=insecure_penalty,
+        folder=folder,
+        **common,
+    )
     rows: list[dict[str, Any]] = []
     for name, given in tests.items():
         rows += untrained(
-            key, env, given, threat, x=x, penalty=penalty, episodes=episodes, name=name
+            key,
+            env,
+            given,
+            threat,
+            x=x,
+            lookahead=lookahead,
+            seed=held.members[0].seed,
+            penalty=penalty,
+            episodes=episodes,
+            name=name,
         )
         for agents, where in ((free, place("unshielded")), (held, folder)):
             rows += evaluate(
@@ -109,6 +132,8 @@ def untrained(
     x: float,
     penalty: float,
     episodes: int,
+    lookahead: int = 0,
+    seed: int = 0,
     name: str = "",
 ) -> list[dict[str, Any]]:
     """Evaluates acting at random: over all actions alike, and over all admissible actions alike.
@@ -121,6 +146,8 @@ def untrained(
         x: largest admissible threat of the shield.
         penalty: taken off the returns per unit of danger.
         episodes: of each.
+        lookahead: of the shield, as in `plan`.
+        seed: number of the episodes, as of an agent.
         name: of the parameters, for the table.
 
     Returns:
@@ -131,13 +158,13 @@ def untrained(
         scores = jax.random.uniform(key, percept.threat.shape)
         return evaluation.shielded(lambda _: scores)(key, percept)
 
-    own = key_of(key, Stream.UNTRAINED)
+    own = numbered(key_of(key, Stream.UNTRAINED), [seed])[0]
     play = jax.jit(lambda pmdp: evaluation.play_episodes(own, pmdp, policy, episodes))
     rows = []
     for method, given in {"random": None, f"random, shield (x={x:g})": threat}.items():
-        found = play(make_pmdp(env, params, given, x=x))
+        found = play(make_pmdp(env, params, given, x=x, lookahead=lookahead))
         evaluation.check(found, method)
-        shown = {"variant": name, "method": method, "seed": 0}
+        shown = {"variant": name, "method": method, "seed": seed}
         shown["x"] = float("inf") if given is None else x
         rows.append({**shown, **evaluation.summarise(found, penalty)})
     return rows

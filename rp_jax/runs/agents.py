@@ -11,6 +11,8 @@ from flax import struct
 from jax import Array
 
 from rp_jax.dynamics import Plans
+from rp_jax.envs import optional
+from rp_jax.envs.contract import Env
 from rp_jax.evaluation import action_values, shielded
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.planning.percept import Percept
@@ -100,10 +102,53 @@ class Agents(Sequence[Agent]):
         weights = jax.tree.map(lambda a: a[index], self.weights)
         return Agent(with_member(self.pmdp, member), weights, self.network)
 
+    def in_world(self, env: Env | None = None, params: Any = None) -> "Agents":
+        """Returns the agents in another world, or in theirs with other parameters.
+
+        Args:
+            env: the world; theirs by default.
+            params: its parameters; those that they learned with by default.
+
+        Raises:
+            ValueError: they cannot act there: something is seen or done otherwise, or the threats
+                hold for another body, baseline policy or hazard.
+        """
+        pmdp = self.pmdp
+        if env is None and params is None:
+            return self
+        there = pmdp.replace(
+            env=pmdp.env if env is None else env, params=pmdp.params if params is None else params
+        )
+        check_same_interface((pmdp.env, pmdp.params), (there.env, there.params))
+        if self.threat is not None:
+            self.threat.check_fits(there.env.sub_rmdps(there.params))
+        return replace(self, pmdp=there)
+
     @property
     def methods(self) -> list[str]:
         """How each is called in tables, (n,)."""
         return [method_name(self.pmdp, member) for member in self.members]
+
+
+def check_same_interface(learned: tuple[Env, Any], other: tuple[Env, Any]) -> None:
+    """Raises ValueError unless what learned in one world can act in another.
+
+    Args:
+        learned: the environment and the parameters of the one.
+        other: those of the other.
+
+    Raises:
+        ValueError: the observation, its LIDAR, or the number of actions differs.
+    """
+    kinds = {
+        "length of the observation": optional.observation_size,
+        "number of LIDAR bins": lambda env, params: optional.lidar_bins(env),
+        "number of actions": optional.num_actions,
+    }
+    for name, of in kinds.items():
+        wanted, found = of(*learned), of(*other)
+        if found != wanted:
+            raise ValueError(f"{name} is {found}; it must be {wanted}, as where the agents learned")
 
 
 def with_member(pmdp: PMDP, member: Member) -> PMDP:

@@ -10,12 +10,12 @@ from jax import Array
 
 from rp_jax import evaluation, statistics
 from rp_jax.envs.contract import Env
-from rp_jax.runs.agents import Agents, with_member
-from rp_jax.runs.evaluate import ROUND, greedily
+from rp_jax.runs.agents import Agents
+from rp_jax.runs.evaluate import ROUND, checked_agents, greedily
 from rp_jax.runs.progress import OnProgress, silent
 from rp_jax.runs.record import short_name
 from rp_jax.streams import Stream, key_of
-from rp_jax.validate import number, random_key, shown
+from rp_jax.validate import number, random_key
 
 POWER = 0.9  # of the test, at the expected crash rate
 
@@ -84,25 +84,16 @@ def certify(
         on_progress: called with (stage, done, total, note).
 
     Raises:
-        ValueError: a number is out of range, or the threats hold for another world.
+        ValueError: a number is out of range, or the agents cannot act in this world.
         FloatingPointError: an observation, a threat or a reward is not a finite number.
     """
     random_key("key", key)
     number("c", c, above=0)
-    if not isinstance(agents, Agents):
-        raise ValueError(
-            f"agents is {shown(agents)}; it must be Agents: one of them is agents[0:1]"
-        )
+    checked_agents(agents)
     number("agent", agent, least=0, most=len(agents) - 1, integer=True)
     n, allowed = statistics.plan_test(c, confidence, c / 2 if expected is None else expected, POWER)
-    subject = agents[agent]
-    pmdp = with_member(agents.pmdp, agents.members[agent])
-    if env is not None or params is not None:
-        world = env or pmdp.env
-        given = pmdp.params if params is None else params
-        if agents.threat is not None:
-            agents.threat.check_fits(world.sub_rmdps(given))
-        pmdp = pmdp.replace(env=world, params=given)
+    subject = agents.in_world(env, params)[agent]
+    pmdp = subject.pmdp
     if on_plan is not None:
         on_plan(n, allowed)
     size = min(ROUND, n)

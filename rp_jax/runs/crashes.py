@@ -45,21 +45,21 @@ class CrashConfig:
 
 
 class Crash(NamedTuple):
-    """The end of an episode, leading axis (steps,), oldest first; the crash comes after it."""
+    """The steps up to the first danger of an episode, leading axis (steps,), oldest first."""
 
     states: Any
     action: np.ndarray
     threat: np.ndarray  # (steps, A)
     secure: np.ndarray
     hit: list[str]  # kinds of hazard
-    length: int  # steps of the episode
+    length: int  # steps of the episode up to there
     insecure: int  # steps in a row, up to the crash, in which no action was admissible
 
 
 def found(
     key: Array, agent: Agent, config: CrashConfig, on_progress: OnProgress = silent
 ) -> tuple[list[Crash], int, int]:
-    """Plays episodes, and keeps the ends of those that crash.
+    """Plays episodes, and keeps the steps before the first danger of those that have any.
 
     Args:
         key: of the episodes.
@@ -89,11 +89,12 @@ def found(
         on_progress("episodes", i, rounds, f"{count} crashes of {i * size:,}")
         shown, collisions = play(jax.random.fold_in(key, i), pmdp)
         finite("crashes: threats", shown.threat)
-        met = np.any(list(collisions.values()), axis=0)
+        finite("crashes: dangers", shown.danger)
+        met = np.asarray(shown.danger) > 0
         crashed = np.flatnonzero(met.any(axis=0))
         count += len(crashed)
         for episode in crashed[: config.most - len(crashes)]:
-            at = int(met[:, episode].argmax())
+            at = int(met[:, episode].argmax()) + 1  # the state after the step
             kinds = [kind for kind, hit in collisions.items() if hit[at, episode]]
             crashes.append(ending(shown, int(episode), at, config.steps, kinds))
     on_progress("episodes", rounds, rounds, f"{count} crashes of {rounds * size:,}")

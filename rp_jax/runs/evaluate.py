@@ -29,7 +29,7 @@ ROUND = 1000  # episodes of an agent side by side
 
 def evaluate(
     key: Array,
-    agents: Agents | Agent,
+    agents: Agents,
     env: Env | None = None,
     params: Any = None,
     *,
@@ -58,26 +58,23 @@ def evaluate(
         A row per agent: returns with 95 % intervals, crashes with exact ones.
 
     Raises:
-        ValueError: a setting is out of range, or the threats hold for another world.
+        ValueError: a setting is out of range, or the agents cannot act in this world.
         FloatingPointError: an observation, a threat or a reward is not a finite number.
     """
     random_key("key", key)
     number("episodes", episodes, least=1, integer=True)
     number("penalty", penalty, least=0)
     one_of("devices", devices, sharing.DEVICES)
-    several = _several(agents)
+    several = checked_agents(agents).in_world(env, params)
     pmdp = several.pmdp
-    if env is not None or params is not None:
-        world = env or pmdp.env
-        given = pmdp.params if params is None else params
-        if several.threat is not None:
-            several.threat.check_fits(world.sub_rmdps(given))
-        pmdp = pmdp.replace(env=world, params=given)
     spec = {
         "env": record.name_of(pmdp.env),
         "key": record.key_data(key),
         "params": record.digest_of(pmdp.params),
-        "agents": record.digest_of((several.weights, several.pmdp.threats)),
+        "agents": record.digest_of((several.weights, pmdp.threats)),
+        "network": several.config.network,
+        "lookahead": pmdp.lookahead,
+        "shielded": pmdp.shielded,
         "members": [member._asdict() for member in several.members],
         "episodes": episodes,
     }
@@ -91,10 +88,22 @@ def evaluate(
     return Table(scored(rows, pmdp, players, penalty, about))
 
 
-def _several(agents: Any) -> Agents:
+def checked_agents(agents: Any) -> Agents:
+    """Returns agents, or says what to give in their place.
+
+    Args:
+        agents: what the user gave.
+
+    Raises:
+        ValueError: they are no `Agents`.
+    """
     if isinstance(agents, Agents):
         return agents
-    raise ValueError(f"agents is {shown(agents)}; it must be Agents: one of them is agents[0:1]")
+    given = "one Agent" if isinstance(agents, Agent) else shown(agents)
+    raise ValueError(
+        f"agents is {given}; it must be Agents, as plan or load returns them; one of them alone is "
+        "agents[0:1]"
+    )
 
 
 class Players(NamedTuple):

@@ -47,6 +47,9 @@ def frontier(
     seeds: int | Sequence[int] = 1,
     config: LoopConfig | None = None,
     lookahead: int = 0,
+    learning_penalty: float = 0.0,
+    learning_penalty_from: float | None = None,
+    insecure_penalty: float = 0.0,
     episodes: int = 10_000,
     penalty: float = 0.0,
     folder: Path | None = None,
@@ -65,7 +68,10 @@ def frontier(
         tests: by name, parameters while testing.
         seeds: how many agents of each kind, or their numbers.
         config: of the learner.
-        lookahead: as in `plan`.
+        lookahead: as in `plan`, like the three penalties of learning.
+        learning_penalty: taken off the reward per unit of danger while learning.
+        learning_penalty_from: what it begins with.
+        insecure_penalty: taken off the reward per state reached in which no action is admissible.
         episodes: evaluated per test and agent.
         penalty: taken off the returns per unit of danger.
         folder: for curves, agents and checkpoints.
@@ -85,6 +91,9 @@ def frontier(
         "seeds": seeds,
         "config": config,
         "lookahead": lookahead,
+        "learning_penalty": learning_penalty,
+        "learning_penalty_from": learning_penalty_from,
+        "insecure_penalty": insecure_penalty,
         "penalty": penalty,
         "devices": devices,
         "on_progress": on_progress,

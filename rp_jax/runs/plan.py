@@ -27,6 +27,7 @@ from rp_jax.runs.agents import Agents, Member, side_by_side
 from rp_jax.runs.progress import OnMetrics, OnProgress, silent
 from rp_jax.shield import rounded_down
 from rp_jax.streams import Stream, key_of, numbered
+from rp_jax.threat import artefact
 from rp_jax.threat.function import ThreatFunction
 from rp_jax.validate import number, one_of, random_key
 
@@ -121,6 +122,8 @@ def plan(
         "threat": None if threat is None else record.digest_of(threat.models),
     }
     where = None if folder is None else Path(folder)
+    if where is not None and threat is not None:
+        _same_threat(where, threat)
     if where is not None and (where / saved.AGENTS / "manifest.json").exists():
         return _finished(where, pmdp, threat, record.plain(spec))
     with record.job(where, "plan", {**spec, **record.machine(env)}) as checkpoints:
@@ -133,6 +136,18 @@ def plan(
             facts = {"spec": record.plain(spec), "settings": dict(settings or {})}
             saved.save_agents(where, agents, facts)
     return agents
+
+
+def _same_threat(folder: Path, threat: ThreatFunction) -> None:
+    """Raises ValueError if a folder holds another threat function."""
+    place = folder / saved.THREAT
+    if (place / "manifest.json").exists():
+        there, wanted = artefact.saved_checksum(place), threat.checksum
+        if there != wanted:
+            raise ValueError(
+                f"folder is {folder}; it holds a threat function with the checksum {there[:16]}; "
+                f"it must be new, empty, or hold the one that is given, with {wanted[:16]}"
+            )
 
 
 def members_of(

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from rp_jax import rare, statistics, storage
-from rp_jax.arrays import select
+from rp_jax.envs import optional
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.runs.agents import Agent
 from rp_jax.runs.progress import OnProgress, silent
@@ -146,28 +146,6 @@ def crashes_from(key: Array, subject: Subject, starts: Any, tries: int) -> np.nd
     return total
 
 
-def offspring(key: Array, parent: Any, fresh: Any, share: float = 0.2) -> Any:
-    """Returns a start like its parent, parts of which are drawn afresh.
-
-    In a world with a field `obstacles`, whose starts are independent of one another, each is drawn
-    afresh with probability `share`; elsewhere the whole start is. So it is one that the environment
-    may draw.
-
-    Args:
-        key: of the choice.
-        parent: a start state.
-        fresh: another one.
-        share: probability that a part is taken from `fresh`.
-    """
-    if not hasattr(parent, "obstacles"):
-        return select(jax.random.bernoulli(key, share), fresh, parent)
-    renewed = jax.random.bernoulli(key, share, parent.present.shape)
-    rows = jax.vmap(select)(
-        renewed, (fresh.obstacles, fresh.present), (parent.obstacles, parent.present)
-    )
-    return parent.replace(obstacles=rows[0], present=rows[1])
-
-
 def distinct(starts: Any) -> Any:
     """Returns each of some starts once, in the order of their first appearance.
 
@@ -206,7 +184,7 @@ def worst_starts(
     draw = jax.jit(
         lambda key: jax.vmap(pmdp.env.reset, (0, None))(jax.random.split(key, size), pmdp.params)
     )
-    breed = jax.jit(jax.vmap(offspring))
+    breed = jax.jit(jax.vmap(lambda *parts: optional.mixed_start(pmdp.env, *parts)))
     first_key, mix, key = jax.random.split(key, 3)
     starts = draw(first_key)
     if first is not None:

@@ -24,7 +24,7 @@ from rp_jax.shield import rounded_down
 from rp_jax.streams import Stream, key_of
 from rp_jax.threat import artefact, build, report
 from rp_jax.threat.build import ThreatConfig
-from rp_jax.threat.function import ThreatFunction
+from rp_jax.threat.function import ThreatFunction, load_threat
 from rp_jax.threat.total import total_threat
 from rp_jax.validate import number, one_of, random_key, shown
 
@@ -116,9 +116,8 @@ def settings_of(
 
 def _finished(folder: Path, subs: Mapping[str, Any], spec: Mapping[str, Any]) -> ThreatFunction:
     """A threat function that was learned before, by the same call."""
-    about = artefact.about(folder)
-    record.compared(f"folder is {folder}", about.get("spec") or {}, spec)
-    return ThreatFunction(artefact.load(folder, None, subs), dict(subs), about)
+    record.compared(f"folder is {folder}", artefact.about(folder).get("spec") or {}, spec)
+    return load_threat(folder, subs)
 
 
 def _learned(

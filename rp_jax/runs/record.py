@@ -1,16 +1,19 @@
 """Facts that a job depends on, kept beside its checkpoints: it resumes only where they agree."""
 
+import ast
 import contextlib
 import functools
 import hashlib
 import importlib.metadata
+import importlib.util
 import json
 import os
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import jax
@@ -36,14 +39,14 @@ def machine(env: Any) -> dict[str, Any]:
     """Returns what must not change for a job to come to the same bits.
 
     Args:
-        env: the environment, or the module of a script; its source counts as well where it is not
-            the library's.
+        env: the environment, or the module of a script; its source counts as well, where it is
+            not the library's.
     """
     return {
         "versions": {name: _version(name) for name in LIBRARIES},
         "device": str(jax.devices()[0]),
         "flags": {name: os.environ.get(name, "") for name in FLAGS},
-        "code": code_of(source_of(env)),
+        "code": code_of(env),
     }
 
 
@@ -71,45 +74,90 @@ def short_name(env: Any) -> str:
     return name_of(env).removeprefix("rp_jax.envs.")
 
 
-def source_of(env: Any) -> Path | None:
-    """Returns the folder with the source of an environment that is not the library's own.
+def code_of(env: Any) -> dict[str, str]:
+    """Returns checksums of the source that computes a job: of the library, and of other files.
+
+    Args:
+        env: the environment, or the module of a script.
+
+    Returns:
+        By name of the file; "rp_jax" stands for the library.
+    """
+    found, files = {"rp_jax": library_code()}, sources_of(env)
+    if files:
+        above = Path(os.path.commonpath([file.parent for file in files])).parent
+        found |= {str(file.relative_to(above)): _sha256([file]) for file in files}
+    return found
+
+
+@functools.cache
+def library_code() -> str:
+    """Returns the checksum of the library's source, but for what shows results."""
+    library = Path(rp_jax.__file__).parent
+    return _sha256(
+        file
+        for file in sorted(library.glob("**/*.py"))
+        if file.relative_to(library).parts[0] not in OUTSIDE
+    )
+
+
+def _sha256(files: Iterable[Path]) -> str:
+    """Returns the first 16 digits of the checksum of some files."""
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def sources_of(env: Any) -> list[Path]:
+    """Returns the files of an environment's module, and of what it imports from its own package.
+
+    For a module without a package, these are the modules beside it. Files of the library itself do
+    not count, nor do those of other packages.
 
     Args:
         env: a module, or an object.
     """
-    module = env if hasattr(env, "__file__") else sys.modules.get(type(env).__module__)
-    file = getattr(module, "__file__", None)
-    if file is None or Path(file).is_relative_to(Path(rp_jax.__file__).parent):
-        return None
-    return Path(file).parent
-
-
-@functools.cache
-def code_of(folder: Path | None) -> str:
-    """Returns the checksum of the source that computes a job.
-
-    Args:
-        folder: with the source of an environment of one's own; None for the library's.
-    """
+    module = env if isinstance(env, ModuleType) else sys.modules.get(type(env).__module__)
+    left, found = [module], set()
     library = Path(rp_jax.__file__).parent
-    files = [
-        file
-        for file in sorted(library.glob("**/*.py"))
-        if file.relative_to(library).parts[0] not in OUTSIDE
-    ]
-    digest = hashlib.sha256()
-    for file in [*files, *(sorted(folder.glob("*.py")) if folder else [])]:
-        digest.update(file.read_bytes())
-    return digest.hexdigest()[:16]
+    while left:
+        module = left.pop()
+        file = Path(getattr(module, "__file__", None) or "")
+        if module is None or file.suffix != ".py" or file in found or not file.is_file():
+            continue
+        if not file.is_relative_to(library):
+            found.add(file)
+            left += [sys.modules.get(name) for name in _own_imports(module, file)]
+    if isinstance(env, ModuleType) or not hasattr(env, "env"):
+        return sorted(found)
+    return sorted(found.union(sources_of(env.env)))  # a wrapper, and what it wraps
+
+
+def _own_imports(module: ModuleType, file: Path) -> set[str]:
+    """Returns names that a module may import from its own package, or from beside it."""
+    package = module.__package__ or ""
+    top, names = package.partition(".")[0], set()
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = "." * node.level + (node.module or "")
+            base = importlib.util.resolve_name(base, package) if node.level else base
+            names |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
+    if top:
+        return {name for name in names if name.partition(".")[0] == top}
+    return {name for name in names if (file.parent / f"{name.partition('.')[0]}.py").is_file()}
 
 
 def digest_of(tree: Any) -> str:
     """Returns the checksum of a pytree: its structure, its arrays, and what is static in it.
 
     Args:
-        tree: any pytree of arrays and keys; static fields count by their text.
+        tree: any pytree of arrays and keys; static fields count by their text, `storage.text`.
     """
-    digest = hashlib.sha256(repr(storage.statics(tree)).encode())
+    statics = {name: storage.text(value) for name, value in storage.statics(tree).items()}
+    digest = hashlib.sha256(repr(statics).encode())
     for name, array in storage.leaves(tree).items():
         digest.update(f"{name} {array.dtype} {array.shape}".encode())
         digest.update(array.tobytes())
@@ -140,8 +188,16 @@ def compared(where: str, found: Mapping[str, Any], wanted: Mapping[str, Any]) ->
                 keys = [k for k in {**odd, **now} if odd.get(k) != now.get(k)]
                 name = f"{name}: {keys[0]}"
                 odd, now = odd.get(keys[0]), now.get(keys[0])
+            if name.startswith("code: "):
+                file = name.removeprefix("code: ")
+                raise ValueError(
+                    f"{where}; its code of {file} has the checksum {odd}, that of here {now}; it "
+                    "must be the same to come to the same bits: go on with the source that it was "
+                    "begun with, or begin in another folder"
+                )
             raise ValueError(
-                f"{where}; its {name} is {odd}; it must be {now} to come to the same bits"
+                f"{where}; its {name} is {odd}; it must be {now} to come to the same bits: repeat "
+                "the call that began it, or begin in another folder"
             )
 
 

@@ -20,7 +20,7 @@ from rp_jax.planning.loop import LoopConfig
 from rp_jax.planning.networks import POOLS
 from rp_jax.planning.percept import Encoded, encode
 from rp_jax.planning.pmdp import PMDP
-from rp_jax.runs import record
+from rp_jax.runs import record, training
 from rp_jax.runs.agents import Agent, Agents, Member
 from rp_jax.runs.dataclass_json import restored
 from rp_jax.threat import artefact
@@ -28,6 +28,7 @@ from rp_jax.threat.function import ThreatFunction, load_threat
 from rp_jax.validate import number, shown
 
 AGENTS, THREAT = "agent", "threat"  # folders inside that of a run
+METRICS = "metrics.jsonl"  # curves of a run
 KIND = "agents"
 
 
@@ -36,10 +37,10 @@ def save(
     thing: Agents | ThreatFunction,
     settings: Mapping[str, Any] | None = None,
 ) -> None:
-    """Saves agents, with the threat function that they go by, or a threat function alone.
+    """Saves agents, with their curves and their threat function, or a threat function alone.
 
     Args:
-        folder: created if missing.
+        folder: created if missing; what was saved there before is replaced.
         thing: what `plan` or `reconnoitre` returned.
         settings: keywords of the environment's `make_params` that made the parameters, so that
             agents can be loaded without these; `make_params()` is tried where none are given.
@@ -48,14 +49,22 @@ def save(
         ValueError: it is neither.
         storage.StorageError: it cannot be written.
     """
+    folder = _path(folder)
     if isinstance(thing, Agent):
         raise ValueError("thing is one Agent; it must be Agents: save agents[0:1]")
     if isinstance(thing, ThreatFunction):
         thing.save(folder)
     elif isinstance(thing, Agents):
-        save_agents(Path(folder), thing, {"settings": dict(settings or {})})
+        save_agents(folder, thing, {"settings": dict(settings or {})})
     else:
         raise ValueError(f"thing is {shown(thing)}; it must be Agents or a ThreatFunction")
+
+
+def _path(folder: Any) -> Path:
+    """Returns the path of a folder."""
+    if not isinstance(folder, str | Path):
+        raise ValueError(f"folder is {shown(folder)}; it must be a path")
+    return Path(folder)
 
 
 def load(folder: str | Path, env: Env | None = None, params: Any = None) -> Any:
@@ -73,8 +82,15 @@ def load(folder: str | Path, env: Env | None = None, params: Any = None) -> Any:
         storage.StorageError: something is missing, damaged, or of another world; or the world or
             its parameters cannot be found by themselves and must be given.
     """
-    folder = Path(folder)
-    alone = (folder / "manifest.json").exists()
+    folder = _path(folder)
+    if not folder.is_dir():
+        raise storage.StorageError(f"folder is {folder}; there is no such folder")
+    alone = not (folder / AGENTS).is_dir()  # a threat function, without agents
+    if alone and not (folder / "manifest.json").exists():
+        raise storage.StorageError(
+            f"folder is {folder}; it must hold agents or a threat function, but has no "
+            f"{AGENTS}/manifest.json and no manifest.json"
+        )
     about = artefact.about(folder) if alone else about_agents(folder)
     world = _world(about) if env is None else env
     if alone:
@@ -84,7 +100,7 @@ def load(folder: str | Path, env: Env | None = None, params: Any = None) -> Any:
         params = _parameters(folder, world, about)
     threat = None
     if about.get("shielded", True):
-        threat = _threat(folder / THREAT, world.sub_rmdps(params))
+        threat = _threat(folder / THREAT, world.sub_rmdps(params), about.get("threat"))
     config = restored(LoopConfig, about.get("config"), f"{folder}: config")
     pmdp = PMDP(
         params=params,
@@ -100,11 +116,17 @@ def load(folder: str | Path, env: Env | None = None, params: Any = None) -> Any:
     return restored_agents(folder, about, pmdp, threat)
 
 
-def _threat(folder: Path, subs: Mapping[str, Any]) -> ThreatFunction:
-    """The threat function of a run; one without models may not have been kept."""
+def _threat(folder: Path, subs: Mapping[str, Any], checksum: Any) -> ThreatFunction:
+    """Returns the threat function of a run; one without models may not have been kept."""
     if not subs and not folder.is_dir():
         return ThreatFunction({}, {})
-    return load_threat(folder, subs)
+    found = load_threat(folder, subs)
+    if checksum is not None and (there := artefact.saved_checksum(folder)) != checksum:
+        raise storage.StorageError(
+            f"{folder}: the threat function's checksum is {there}; it must be {checksum}, that of "
+            "the one which the agents were saved with"
+        )
+    return found
 
 
 def imported(name: Any) -> Any:
@@ -127,8 +149,13 @@ def imported(name: Any) -> Any:
 
 def _world(about: Mapping[str, Any]) -> Any:
     """Returns the environment that the facts of a file name."""
+    name = about.get("env") or about.get("environment")
+    if not name:
+        raise storage.StorageError(
+            "the file does not name its environment; it must be given: load(folder, env=...)"
+        )
     try:
-        return imported(about.get("env") or about.get("environment"))
+        return imported(name)
     except storage.StorageError as error:
         raise storage.StorageError(f"{error}; or give it: load(folder, env=...)") from error
 
@@ -138,7 +165,13 @@ def _made(env: Any, settings: Mapping[str, Any], where: Path) -> Any:
         raise storage.StorageError(
             f"{where}: {record.name_of(env)} has no make_params; params must be given"
         )
-    return env.make_params(**settings)
+    try:
+        return env.make_params(**settings)
+    except (TypeError, ValueError) as error:
+        raise storage.StorageError(
+            f"{where}: the settings {dict(settings)} do not fit {record.name_of(env)}.make_params "
+            f"({error}); the world must be the one that was saved, or params must be given"
+        ) from error
 
 
 def save_agents(folder: Path, agents: Agents, more: Mapping[str, Any]) -> None:
@@ -152,9 +185,8 @@ def save_agents(folder: Path, agents: Agents, more: Mapping[str, Any]) -> None:
     Raises:
         storage.StorageError: it cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     env, params, network = agents.pmdp.env, agents.pmdp.params, agents.network
-    if agents.threat is not None and not (folder / THREAT / "manifest.json").exists():
+    if agents.threat is not None:
         agents.threat.save(folder / THREAT, record.name_of(env))
     settings = dict(more.get("settings") or {})
     facts, arrays = _difference(env, settings, params)
@@ -170,6 +202,7 @@ def save_agents(folder: Path, agents: Agents, more: Mapping[str, Any]) -> None:
         "num_actions": agents.pmdp.num_actions,
         "scale": list(getattr(network, "scale", ())),
         "shielded": agents.pmdp.shielded,
+        "threat": None if agents.threat is None else agents.threat.checksum,
         "lookahead": agents.pmdp.lookahead,
         "insecure_penalty": float(agents.pmdp.insecure_penalty),
         "seconds": agents.seconds,
@@ -178,6 +211,7 @@ def save_agents(folder: Path, agents: Agents, more: Mapping[str, Any]) -> None:
     }
     tree = {"weights": agents.weights, "params": arrays}
     storage.save(folder / AGENTS, KIND, tree, about)
+    training.write_lines(folder / METRICS, agents.history)
 
 
 def about_agents(folder: Path) -> dict[str, Any]:
@@ -231,7 +265,7 @@ def restored_agents(
         lambda s: jax.ShapeDtypeStruct((len(members), *s.shape), s.dtype), shapes
     )
     tree = storage.load(folder / AGENTS, KIND, {"weights": weights, "params": _claimed(folder)})
-    history = _history(folder / "metrics.jsonl")
+    history = _history(folder / METRICS)
     return Agents(
         pmdp,
         network,

@@ -16,12 +16,14 @@ from rp_jax.checkpoints import equal_chunks
 from rp_jax.envs.check import check_contract
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.runs import record, saved, training
-from rp_jax.runs.agents import Agents
+from rp_jax.runs.agents import Agents, check_same_interface
 from rp_jax.runs.evaluate import evaluate, time_agents
 from rp_jax.runs.plan import make_pmdp, plan
 from rp_jax.runs.progress import OnMetrics, OnProgress, silent
 from rp_jax.runs.reconnoitre import reconnoitre, settings_of
 from rp_jax.runs.tables import Table
+from rp_jax.streams import Stream, key_of, numbered
+from rp_jax.threat import artefact
 from rp_jax.threat.build import ThreatConfig
 from rp_jax.threat.function import ThreatFunction, load_threat
 from rp_jax.validate import number, one_of, within
@@ -136,11 +138,35 @@ def checked(
     tests = {name: world.params(name) for name in world.tests}
     check_contract(world.env, params)
     subs = world.env.sub_rmdps(params)
+    for name, given in tests.items():
+        with within(f"test {name}"):
+            check_same_world(world.env, params, given, config.shield)
     settings_of({kind: threats[kind] for kind in subs if kind in threats}, subs)
     if process.threat is not None:
         load_threat(process.threat, subs)
     make_pmdp(world.env, params, None, x=config.x, config=config.planning)
     return tests
+
+
+def check_same_world(env: Any, params: Any, test: Any, shield: bool) -> None:
+    """Raises ValueError unless what learns with some parameters can be tested with others.
+
+    Args:
+        env: the world.
+        params: its parameters while learning.
+        test: its parameters in a test.
+        shield: whether agents go by a threat function.
+
+    Raises:
+        ValueError: something is seen or done otherwise, or the threats hold for another body,
+            baseline policy or hazard.
+    """
+    check_same_interface((env, params), (env, test))
+    if shield:
+        found, wanted = env.sub_rmdps(test), env.sub_rmdps(params)
+        artefact.same_kinds("hazards of the world", found, wanted)
+        for kind, sub in wanted.items():
+            artefact.same_sub(kind, found[kind], sub)
 
 
 def train(
@@ -246,7 +272,7 @@ def threat_of(
         return load_threat(place, subs)
     own = {kind: threats[kind] for kind in subs if kind in threats}
     return reconnoitre(
-        jax.random.fold_in(key, config.seed),
+        numbered(key_of(key, Stream.THREAT), [config.seed])[0],
         world.env,
         params,
         x=config.x if 0 < config.x < 1 else 0.01,

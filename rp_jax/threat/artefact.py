@@ -28,7 +28,7 @@ def save(
 
     Args:
         folder: created if it is missing.
-        environment: name of the environment; `load` can ask for it again.
+        environment: name of the environment, by which `rp_jax.load` finds it again.
         models: the models by kind of hazard.
         subs: the sub-R-MDPs by kind of hazard.
         about: other facts worth keeping, such as reports.
@@ -40,34 +40,55 @@ def save(
         kind: {"hidden": model.network.hidden, "activation": model.network.activation}
         for kind, model in models.items()
     }
-    tree = {kind: {"model": models[kind], "sub": subs[kind]} for kind in models}
     statics = {kind: _texts(subs[kind]) for kind in models}
-    facts = {"environment": environment, "networks": networks, "statics": statics, **about}
-    storage.save(folder, KIND, tree, facts)
+    facts = {**about, "environment": environment, "networks": networks, "statics": statics}
+    storage.save(folder, KIND, _tree(models, subs), facts)
+
+
+def checksum(models: Mapping[str, ThreatModel], subs: Mapping[str, SubRMDP]) -> str:
+    """Returns the SHA-256 of the models and the sub-R-MDPs that they hold for, as `save` states it.
+
+    Args:
+        models: the models by kind of hazard.
+        subs: the sub-R-MDPs by kind of hazard.
+    """
+    return storage.checksum(_tree(models, subs))
+
+
+def _tree(models: Mapping[str, ThreatModel], subs: Mapping[str, SubRMDP]) -> dict[str, Any]:
+    """Returns the arrays that are saved, by kind of hazard."""
+    return {kind: {"model": models[kind], "sub": subs[kind]} for kind in models}
+
+
+def saved_checksum(folder: Path) -> str:
+    """Returns the SHA-256 that a saved threat function states.
+
+    Args:
+        folder: the folder given to `save`.
+
+    Raises:
+        storage.StorageError: there is no threat function, or it is damaged.
+    """
+    return str(storage.read_manifest(folder, KIND)["sha256"])
 
 
 def load(
-    folder: Path, environment: str | None, subs: Mapping[str, SubRMDP]
-) -> dict[str, ThreatModel]:
+    folder: Path, subs: Mapping[str, SubRMDP]
+) -> tuple[dict[str, ThreatModel], dict[str, SubRMDP]]:
     """Loads the models that `save` wrote.
 
     Args:
         folder: the folder given to `save`.
-        environment: the name given to `save`; None accepts any name.
         subs: the sub-R-MDPs that the models must hold for, by kind of hazard.
 
     Returns:
-        The models by kind of hazard.
+        The models, and the sub-R-MDPs that they were saved with, by kind of hazard.
 
     Raises:
         storage.StorageError: the file is damaged, or holds for another environment, other
             dynamics, another baseline policy or other hazards.
     """
     known = about(folder)
-    if environment is not None and known.get("environment") != environment:
-        raise storage.StorageError(
-            f"{folder}: environment is {known.get('environment')!r}; it must be {environment!r}"
-        )
     networks: Any = known.get("networks")
     same_kinds(str(folder), networks, subs)
     for kind, sub in subs.items():
@@ -79,7 +100,8 @@ def load(
     tree = storage.load(folder, KIND, like)
     for kind, sub in subs.items():
         same_sub(f"{folder}: {kind}", tree[kind]["sub"], sub)
-    return {kind: tree[kind]["model"] for kind in subs}
+    models, known_subs = ({kind: tree[kind][part] for kind in subs} for part in ("model", "sub"))
+    return models, known_subs
 
 
 def about(folder: Path) -> dict[str, Any]:
@@ -122,11 +144,11 @@ def same_sub(where: str, found: SubRMDP, wanted: SubRMDP) -> None:
         storage.StorageError: a number or a static field differs; the message names it.
     """
     have = storage.leaves(found)
-    known = {name: str(value) for name, value in storage.statics(found).items()}
-    for name, value in storage.statics(wanted).items():
-        if known.get(name, str(value)) != str(value):
+    known = _texts(found)
+    for name, text in _texts(wanted).items():
+        if known.get(name, text) != text:
             raise storage.StorageError(
-                f"{where}: {name} is {known[name]}; for this environment it must be {value}"
+                f"{where}: {name} is {known[name]}; for this environment it must be {text}"
             )
     for name, value in storage.leaves(wanted).items():
         there = have.get(name)
@@ -156,7 +178,7 @@ def _same_statics(where: str, saved: Any, kind: str, sub: SubRMDP) -> None:
 
 def _texts(sub: SubRMDP) -> dict[str, str]:
     """Returns the static fields of a sub-R-MDP (a horizon, a body's model) as texts, by path."""
-    return {name: str(value) for name, value in storage.statics(sub).items()}
+    return {name: storage.text(value) for name, value in storage.statics(sub).items()}
 
 
 def _blank(folder: Path, kind: str, facts: Any, sub: SubRMDP) -> ThreatModel:

@@ -27,12 +27,19 @@ class ThreatFunction:
 
         Args:
             folder: created if it is missing.
-            environment: name of the environment, to be found again in the file.
+            environment: name of the environment; by default of the one that it was learned in.
 
         Raises:
             storage.StorageError: the folder or a file cannot be written.
         """
-        artefact.save(Path(folder), environment, self.models, self.subs, self.about)
+        learned_in = self.about.get("environment") or self.about.get("spec", {}).get("env", "")
+        name = environment or str(learned_in)
+        artefact.save(Path(folder), name, self.models, self.subs, self.about)
+
+    @property
+    def checksum(self) -> str:
+        """The SHA-256 of the models and the sub-R-MDPs that they hold for."""
+        return artefact.checksum(self.models, self.subs)
 
     def check_fits(self, subs: Mapping[str, SubRMDP], where: str = "threat") -> None:
         """Raises StorageError unless the function holds for an environment.
@@ -60,5 +67,4 @@ def load_threat(folder: str | Path, subs: Mapping[str, SubRMDP]) -> ThreatFuncti
         storage.StorageError: there is no threat function, it is damaged, or it holds for another
             environment.
     """
-    models = artefact.load(Path(folder), None, subs)
-    return ThreatFunction(models, dict(subs), artefact.about(Path(folder)))
+    return ThreatFunction(*artefact.load(Path(folder), subs), artefact.about(Path(folder)))

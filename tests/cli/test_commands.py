@@ -120,14 +120,14 @@ def test_a_run_with_something_missing_is_refused(missing, finished, tmp_path):
 def test_a_rate_is_shown_or_not_shown_with_the_planned_episodes(finished, tmp_path, capsys):
     out = tmp_path / "row.json"
     common = ["certify", "--run", finished, "--out", out]
-    with pytest.raises(SystemExit, match="0"):  # nothing crashes for certain
-        call(*common, "--c", "0.999", "--confidence", "0.9", "--expected", "0.9")
+    with pytest.raises(SystemExit, match="0"):  # in a single step from rest nothing is hit
+        call(*common, "--c", "0.2", "--confidence", "0.9", "--set", "time_limit=1")
     row = json.loads(out.read_text())
     assert row["shown"]
     assert row["crashes"] <= row["allowed_crashes"]
     assert row["episodes"] == row["planned_episodes"]
-    assert row["upper_bound"] <= 0.999
-    assert "SHOWN: circuit circle" in " ".join(capsys.readouterr().out.split())
+    assert row["upper_bound"] <= 0.2
+    assert "SHOWN: circuit circle time_limit=1" in " ".join(capsys.readouterr().out.split())
     with pytest.raises(SystemExit, match="1"):
         call(*common, "--c", "0.2", "--expected", "0")  # it has hardly learned
     row = json.loads(out.read_text())

@@ -91,7 +91,7 @@ def test_an_interrupted_run_of_other_code_begins_anew(runs, tmp_path, monkeypatc
     runs.stops.add("jam")
     with pytest.raises(KeyboardInterrupt):
         module.Sources(tmp_path, "quick")("jam")
-    monkeypatch.setattr(record, "code_of", lambda folder: "other")
+    monkeypatch.setattr(record, "code_of", lambda env: {"rp_jax": "other"})
     module.Sources(tmp_path, "quick")("jam")
     assert "--resume" not in runs.commands[1]
 

@@ -95,7 +95,7 @@ def test_steps_without_an_admissible_action_are_counted():
         "threat": np.zeros((5, 1, 3)),
         "states": jax.tree.map(lambda a: np.zeros((5, 1)), states),
     }
-    recording = Recording(admissible=None, alive=None, **shown)
+    recording = Recording(admissible=None, alive=None, danger=None, **shown)
     crash = crashes.ending(recording, 0, 4, 3, ["pit"])
     assert (crash.length, crash.insecure) == (4, 2)
     np.testing.assert_array_equal(crash.secure, [True, False, False])

@@ -92,7 +92,7 @@ def loaded(path, change, load):
 
 def threat(whole, copy, path, change):
     """Of a changed threat function: refused, or the same models."""
-    found = loaded(path, change, lambda: artefact.load(copy / "threat", None, whole[2]))
+    found = loaded(path, change, lambda: artefact.load(copy / "threat", whole[2])[0])
     assert str(copy) in found if isinstance(found, str) else same(found, whole[1].threat.models)
 
 

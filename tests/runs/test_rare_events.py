@@ -1,12 +1,13 @@
+import functools
 import types
 
 import jax
 import numpy as np
 import pytest
 
+from examples.drone import world as drone
 from rp_jax import storage
-from rp_jax.envs import circuit, jam
-from rp_jax.envs.tracks import circle_plan
+from rp_jax.envs import circuit, jam, optional
 from rp_jax.runs import rare_events
 from rp_jax.runs.rare_events import RareConfig, Subject
 
@@ -56,21 +57,40 @@ def test_the_search_for_worst_starts_descends_from_many_and_keeps_none_twice():
     assert len(begun) == 10
 
 
-def test_offspring_differ_from_their_parent_in_some_obstacles():
+def test_children_differ_from_their_parent_in_some_obstacles():
     params = jam.make_params(8)
-    parent = jam.reset(jax.random.key(0), params)
-    fresh = jam.reset(jax.random.key(1), params)
-    child = rare_events.offspring(jax.random.key(2), parent, fresh, 0.5)
-    same = np.asarray((child.obstacles.position == parent.obstacles.position).all(-1))
-    other = np.asarray((child.obstacles.position == fresh.obstacles.position).all(-1))
+    keys = jax.random.split(jax.random.key(2), 200)
+    parent, fresh = (jam.reset(jax.random.key(i), params) for i in (0, 1))
+    child = jax.vmap(lambda key: optional.mixed_start(jam, key, parent, fresh))(keys)
+    place, *places = (np.asarray(s.obstacles.position) for s in (child, parent, fresh))
+    same, other = ((place == known).all(axis=-1) for known in places)
     assert (same ^ other).all()
-    assert same.any()
-    assert other.any()
-    alone = circuit.make_params(circle_plan())
-    first, second = (circuit.reset(jax.random.key(i), alone) for i in (0, 1))
-    for share, wanted in ((0.0, first), (1.0, second)):
-        jax.tree.map(
-            np.testing.assert_array_equal,
-            rare_events.offspring(jax.random.key(3), first, second, share),
-            wanted,
-        )
+    assert 0.15 < other.mean() < 0.25  # 1,600 draws of .2
+    assert (other.any(axis=1) & same.any(axis=1)).mean() > 0.7  # 1 - .2^8 - .8^8 = .83
+
+
+def test_children_in_a_world_without_such_parts_are_one_start_or_the_other():
+    keys = jax.random.split(jax.random.key(3), 400)
+    for env in (circuit, drone):  # the drone has obstacles of three kinds, and does not say
+        params = env.make_params()
+        first, second = (env.reset(jax.random.key(i), params) for i in (0, 1))
+        mixed = jax.vmap(functools.partial(optional.mixed_start, env), (0, None, None))
+        found = mixed(keys, first, second)
+        rows = [
+            jax.tree.map(lambda a, b: (a == b[None]).reshape(400, -1).all(axis=1), found, start)
+            for start in (first, second)
+        ]
+        of_first, of_second = (np.all(jax.tree.leaves(of), axis=0) for of in rows)
+        assert (of_first ^ of_second).all()
+        assert 0.12 < of_second.mean() < 0.28
+
+
+def test_worst_starts_are_found_in_a_world_of_ones_own():
+    params = drone.make_params()
+    stage = lambda key, paths, pmdp, level: paths._replace(  # noqa: E731
+        crashed=paths.states.body.position[:, 0] > 0
+    )
+    subject = Subject(types.SimpleNamespace(env=drone, params=params, x=np.float32(0)), None, stage)
+    config = RareConfig(generations=2, population=10, tries=1, kept=3, checks=1)
+    found = rare_events.worst_starts(jax.random.key(1), subject, None, config)
+    assert found.time.shape == (3,)

@@ -148,7 +148,7 @@ def test_a_saved_threat_function_serves_another_track_and_threshold(finished, tm
     found = train.threat_of(key, world, config, {}, tmp_path, process, silent)
     subs = world.env.sub_rmdps(world.params())
     for folder in (finished, tmp_path):  # the new run's folder is whole without the other's
-        kept = storage.leaves(artefact.load(folder / "threat", None, subs))
+        kept = storage.leaves(artefact.load(folder / "threat", subs)[0])
         for name, array in storage.leaves(found.models).items():
             np.testing.assert_array_equal(array, kept[name])
     about = [artefact.about(folder / "threat") for folder in (finished, tmp_path)]

@@ -41,9 +41,9 @@ def saved(tmp_path):
     return tmp_path
 
 
-def refused(folder, message, environment="jam", subs=None):
+def refused(folder, message, subs=None):
     with pytest.raises(StorageError, match=message):
-        artefact.load(folder, environment, subs_of(jam) if subs is None else subs)
+        artefact.load(folder, subs_of(jam) if subs is None else subs)
 
 
 def arrays_of(folder):
@@ -64,7 +64,7 @@ def edit(folder, change):
 def test_models_come_back_bit_by_bit(env, tmp_path):
     name = env.__name__
     artefact.save(tmp_path, name, models_of(env), subs_of(env), {"x": 0.01})
-    found = artefact.load(tmp_path, name, subs_of(env))
+    found = artefact.load(tmp_path, subs_of(env))[0]
     assert set(found) == set(models_of(env))
     for kind, model in models_of(env).items():
         assert found[kind].network == model.network
@@ -84,7 +84,7 @@ def test_it_says_what_it_is(saved):
 
 def test_it_serves_other_counts_and_time_limits(saved):
     others = subs_of(jam, num_obstacles=15, time_limit=7, fidelity="paper")
-    assert set(artefact.load(saved, "jam", others)) == {"wall", "obstacle"}
+    assert set(artefact.load(saved, others)[0]) == {"wall", "obstacle"}
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.6, 0.999])
@@ -120,15 +120,10 @@ def test_a_missing_folder_is_named(tmp_path):
     refused(tmp_path / "nowhere", r"nowhere: there is no manifest\.json; .* threat function")
 
 
-def test_another_environment_is_refused(saved):
-    refused(saved, "environment is 'jam'; it must be 'circuit'", "circuit", subs_of(circuit))
-
-
 def test_other_hazards_are_refused(saved, tmp_path):
     refused(
         saved,
         r"hazards are \['obstacle', 'wall'\]; they must be \['wall'\]",
-        "jam",
         {"wall": subs_of(jam)["wall"]},
     )
     artefact.save(tmp_path / "c", "jam", models_of(circuit), subs_of(circuit), {})
@@ -160,7 +155,7 @@ def test_another_body_is_refused(tmp_path):
     body = subs["cart"].body
     heavy = body.replace(model=body.model.replace('mass="1"', 'mass="2"'))
     subs["cart"] = subs["cart"].replace(body=heavy)
-    refused(tmp_path, "cart: body/model is <mujoco.*; for this .* must be", "trolley", subs)
+    refused(tmp_path, "cart: body/model is <mujoco.*; for this .* must be", subs)
 
 
 @pytest.mark.parametrize("statics", [[], {"wall": None}, {"wall": {"source/horizon": [5]}}])
@@ -171,7 +166,7 @@ def test_forged_statics_are_refused(statics, saved):
 
 def test_what_was_saved_without_statics_still_loads(saved):
     edit(saved, lambda about: about.pop("statics"))
-    assert set(artefact.load(saved, "jam", subs_of(jam))) == {"wall", "obstacle"}
+    assert set(artefact.load(saved, subs_of(jam))[0]) == {"wall", "obstacle"}
 
 
 def test_another_baseline_policy_is_refused(saved):
@@ -231,7 +226,7 @@ def test_models_without_their_hazards_are_not_saved_half(tmp_path):
 
 
 def test_the_source_of_a_loaded_model_is_the_saved_one(saved):
-    found = artefact.load(saved, "jam", subs_of(jam))["obstacle"].source
+    found = artefact.load(saved, subs_of(jam))[0]["obstacle"].source
     for field in dataclasses.fields(found):
         old = getattr(models_of(jam)["obstacle"].source, field.name)
         assert jax.tree.all(jax.tree.map(np.array_equal, getattr(found, field.name), old))

@@ -22,7 +22,15 @@ FUNCTIONS = {
     "hazards": "(state, params)",
     "sub_rmdps": "(params)",
 }
-OPTIONAL = ("num_actions", "collisions", "clearance", "make_params", "without_moving_hazards")
+OPTIONAL = (
+    "num_actions",
+    "collisions",
+    "clearance",
+    "threshold",
+    "make_params",
+    "mixed_start",
+    "without_moving_hazards",
+)
 OUTCOME = {
     "reward": "floating",
     "danger": "floating",
