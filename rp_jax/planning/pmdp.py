@@ -135,6 +135,8 @@ class PMDP(struct.PyTreeNode):
                 kind: group._replace(present=group.present & alive[:, None])
                 for kind, group in hazards.items()
             }
+        if static is None and not hazards:
+            return jnp.zeros((states.time.shape[0], self.num_actions))
         if static is None:
             return total_threat(self.threats, states.body, hazards)
         if hazards:

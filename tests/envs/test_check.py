@@ -5,6 +5,7 @@ import pickle
 import re
 import types
 
+import bead
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +18,8 @@ from examples.trolley import world as trolley
 from rp_jax.dynamics import (
     ControlDistribution,
     VehicleModel,
+    advance,
+    angle_of,
     independent_controls,
     mirrored_actions,
 )
@@ -27,6 +30,8 @@ from rp_jax.envs.check.comparison import told_apart
 from rp_jax.envs.check.problems import own_settings
 from rp_jax.envs.check.trial import Trial
 from rp_jax.hazards import MovingObstacle, WallPoint
+from rp_jax.runs.plan import make_pmdp
+from rp_jax.threat.function import ThreatFunction
 
 SOUND = {
     "crossing": (crossing, crossing.make_params),
@@ -109,6 +114,29 @@ def a_clearance_that_is_a_number():
 @mutant("contract", r"no function `clearance` although params.body.baseline is Plans")
 def plans_without_clearance():
     return changed(jam, leave_out=["clearance"]), jam.make_params(baseline="plans")
+
+
+@mutant("contract", r"threshold\(state\) is int32\[\]; it must be \(\) floating")
+def a_threshold_that_is_whole():
+    return changed(crossing, threshold=lambda state: state.time), crossing.make_params()
+
+
+@mutant("contract", r"threshold of the environment is 0.01; it must be a function")
+def a_threshold_that_is_a_number():
+    return changed(crossing, threshold=0.01), crossing.make_params()
+
+
+@mutant("contract", r"SCALE is 2.0; it must be a tuple of numbers")
+def a_scale_that_is_a_number():
+    return changed(crossing, SCALE=2.0), crossing.make_params()
+
+
+@mutant(
+    "finite values", r"observe: value \d+ of the LIDAR is outside \[0, 1\] in .* states", slow=True
+)
+def a_scan_in_room_units():
+    observe = lambda state, params: jam.observe(state, params).at[:360].multiply(3.0)  # noqa: E731
+    return changed(jam, observe=observe), jam.make_params()
 
 
 @mutant("contract", r"params has no field `time_limit`")
@@ -771,6 +799,33 @@ def a_swing_that_is_not_mirrored():
 # --- 8. windows ---
 
 
+@mutant(
+    "samples",
+    r"sample of the source of 'pedestrian' leaves out states .* feature 4 is in \[0, 0.03",
+)
+def samples_of_slow_cars_alone():
+    class Pedestrian(crossing.Pedestrian):
+        def sample(self, key, model):
+            car, walker = super().sample(key, model)
+            return car.replace(speed=0.3 * car.speed), walker
+
+    return with_pedestrian(Pedestrian)
+
+
+@mutant(
+    "samples",
+    r"sample of the source of 'pedestrian' leaves out states .* feature 1 is in \[0",
+    slow=True,
+)
+def samples_of_one_side():
+    class Pedestrian(crossing.Pedestrian):
+        def sample(self, key, model):
+            car, walker = super().sample(key, model)
+            return car, walker.replace(position=walker.position.at[1].apply(jnp.abs))
+
+    return with_pedestrian(Pedestrian)
+
+
 @mutant("reach", r"in_reach of the source of 'pedestrian' is too narrow: within 8 steps .* hit in")
 def a_window_that_forgets_the_pace():
     params = crossing.make_params()
@@ -790,6 +845,45 @@ def a_window_without_the_swing():
     params = trolley.make_params()
     half = jax.tree.map(lambda a: 0.4 * a, params.cart.window)
     return trolley, params.replace(cart=params.cart.replace(window=half))
+
+
+# --- delayed controls and plans ---
+
+
+@mutant(
+    "delayed controls", r"delayed is True, but a control decides at once whether a hazard is hit"
+)
+def controls_that_act_at_once():
+    class Agile(VehicleModel):
+        def step(self, vehicle, control):
+            return advance(vehicle, control, self.speeds, False)
+
+    world, params = with_body(Agile)
+    fast = params.body.replace(speeds=params.body.speeds * 2)
+    return world, params.replace(body=fast)
+
+
+@mutant("plans", r"plan \d+ still moves after its horizon of 4 steps, by 0\.\d+ in a step")
+def plans_that_are_cut_off():
+    params = jam.make_params(baseline="plans")
+    plans = params.body.baseline.replace(horizon=4)
+    return jam, params.replace(body=params.body.replace(baseline=plans))
+
+
+@mutant("plans", r"plan \d+ takes a control that is none of params\.body\.actions")
+def plans_with_a_turn_of_their_own():
+    params = jam.make_params(baseline="plans")
+    plans = params.body.baseline
+    half = 0.5 * angle_of(plans.rotation)
+    plans = plans.replace(rotation=jnp.stack([jnp.cos(half), jnp.sin(half)], axis=-1))
+    return jam, params.replace(body=params.body.replace(baseline=plans))
+
+
+@mutant("plans", r"plan \d+ takes a control that is none of params\.body\.actions", slow=True)
+def plans_that_brake_harder_than_the_agent_can():
+    params = circuit.make_params(baseline="plans")
+    plans = params.body.baseline.replace(max_acceleration=jnp.asarray(0.04))
+    return circuit, params.replace(body=params.body.replace(baseline=plans))
 
 
 # --- 9. dangers ---
@@ -1004,6 +1098,61 @@ def test_what_may_be_left_out_is_not_missed_and_settings_of_jax_are_left_alone()
 @pytest.mark.parametrize("order", [False, True])
 def test_an_object_passes_without_what_may_be_left_out_in_any_order_of_hazards(order):
     assert check_env(World(order), crossing.make_params()) is None
+
+
+class Viewed(struct.PyTreeNode):
+    """A state of the crossing that holds the simulator's, and computes body and time from it."""
+
+    inner: object
+
+    @property
+    def body(self):
+        return self.inner.body
+
+    @property
+    def time(self):
+        return self.inner.time
+
+
+@pytest.mark.slow
+def test_body_and_time_of_a_state_may_be_computed():
+    def step(key, state, action, params):
+        reached, outcome = crossing.step(key, state.inner, action, params)
+        return Viewed(reached), outcome
+
+    world = changed(
+        crossing,
+        reset=lambda key, params: Viewed(crossing.reset(key, params)),
+        step=step,
+        observe=lambda state, params: crossing.observe(state.inner, params),
+        hazards=lambda state, params: crossing.hazards(state.inner, params),
+    )
+    assert problems_of(world, crossing.make_params()) == ()
+
+
+@pytest.mark.slow
+def test_positions_may_have_one_axis():
+    assert problems_of(bead, bead.make_params()) == ()
+
+
+def test_a_world_may_have_no_hazards():
+    world = changed(
+        crossing, hazards=lambda state, params: {}, sub_rmdps=lambda params: {}, leave_out=["step"]
+    )
+
+    def step(key, state, action, params):
+        reached, outcome = crossing.step(key, state, action, params)
+        fine = jnp.zeros_like(outcome.terminated)
+        ended = contract.ended(fine, reached.time, params.time_limit)
+        calm = outcome.replace(danger=0 * outcome.danger, terminated=ended[0], truncated=ended[1])
+        return reached, calm
+
+    world.step = step
+    params = crossing.make_params()
+    assert check_contract(world, params) is None
+    pmdp = make_pmdp(world, params, ThreatFunction({}, {}))
+    states = jax.vmap(world.reset, (0, None))(jax.random.split(jax.random.key(0), 3), params)
+    np.testing.assert_array_equal(pmdp.threat(states), np.zeros((3, 9)))
 
 
 class Keyed(struct.PyTreeNode):

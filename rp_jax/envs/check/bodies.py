@@ -5,10 +5,14 @@ from typing import Any
 import jax
 import numpy as np
 
+from rp_jax.dynamics import delayed
 from rp_jax.envs.check.batches import Batched, flat, join, take, typed
 from rp_jax.envs.check.comparison import RARE, unequal
 from rp_jax.envs.check.problems import number_of, same_structure, value_of
 from rp_jax.envs.check.trial import Trial
+
+HASTY = 8192  # pairs that are stepped under two actions
+PLANNED = 512  # rollouts of plans
 
 
 def body_disagreements(trial: Trial) -> list[str]:
@@ -60,6 +64,73 @@ def _alike(one: Any, other: Any) -> bool:
         return False
     pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
     return all(np.array_equal(np.asarray(a), np.asarray(b)) for a, b in pairs)
+
+
+def hasty_controls(trial: Trial) -> list[str]:
+    """Returns for which kinds a control decides at once what is hit, though it is delayed.
+
+    Args:
+        trial: the environment.
+    """
+    if not delayed(trial.model):
+        return []
+    found = []
+    for kind, pairs in trial.pairs.items():
+        body, hazard = pairs.sample(HASTY)
+        one, other = (
+            pairs.look(trial.away(body, trial.draws.integers(HASTY, trial.num_actions)), hazard)[1]
+            for _ in range(2)
+        )
+        unlike = int((one != other).sum())
+        if unlike > RARE * HASTY:
+            found.append(
+                "params.body.delayed is True, but a control decides at once whether a hazard is "
+                f"hit: after one step under two actions, `hits` of the source of {kind!r} differs "
+                f"in {number_of(unlike, HASTY, 'pairs')}; `delayed` must be False, or the last "
+                "control is left out of the threats"
+            )
+    return found
+
+
+def restless_plans(trial: Trial) -> list[str]:
+    """Returns which plans do not end at rest, or take controls that no action has.
+
+    Args:
+        trial: the environment.
+    """
+    if not trial.plans:
+        return []
+    plans, draws = trial.model.baseline, trial.draws
+    rows = draws.among(np.arange(len(trial.steps.action)), PLANNED)
+    body, choice = take(trial.steps.before.body, rows), draws.uniform(PLANNED)
+    plan = (choice.astype(np.float32) * len(plans.target)).astype(int)
+    actions, odd = draws.integers(PLANNED, trial.num_actions), np.zeros(PLANNED, bool)
+    table = flat(jax.device_get(trial.model.actions))
+    body = trial.away(body, actions)
+    for k in range(plans.horizon - 1):
+        control = flat(trial.control(body, k, choice))
+        gaps = np.abs(control[:, None] - table).max(axis=-1).min(axis=-1)
+        odd |= gaps > 1e-5 * (1 + np.abs(table).max())
+        body = trial.away(body, actions, k, choice)
+    found = []
+    moved = trial.away(body, actions, plans.horizon - 1, choice)
+    gone = np.abs(moved.position - body.position).max(axis=-1)
+    restless = gone > 1e-5 * (1 + np.abs(body.position).max())
+    if restless.any():
+        i = int(np.argmax(restless))
+        found.append(
+            f"params.body.baseline: plan {plan[i]} still moves after its horizon of "
+            f"{plans.horizon} steps, by {gone[i]:.6g} in a step (in "
+            f"{number_of(int(restless.sum()), PLANNED, 'rollouts')}); each must be at rest then"
+        )
+    if odd.any():
+        i = int(np.argmax(odd))
+        found.append(
+            f"params.body.baseline: plan {plan[i]} takes a control that is none of "
+            f"params.body.actions (in {number_of(int(odd.sum()), PLANNED, 'rollouts')}); the agent "
+            "must be able to follow each plan"
+        )
+    return found
 
 
 def odd_controls(trial: Trial) -> list[str]:

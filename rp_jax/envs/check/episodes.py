@@ -23,6 +23,14 @@ def odd_values(trial: Trial) -> list[str]:
             f"observe: value {index} of the observation is not finite in "
             f"{number_of(int(bad.sum()), count, 'states')}; all must be finite"
         )
+    outside = np.asarray(steps.scan) >= 0
+    if outside.any():
+        index = int(steps.scan[outside][0])
+        found.append(
+            f"observe: value {index} of the LIDAR is outside [0, 1] in "
+            f"{number_of(int(outside.sum()), count, 'states')}; the first LIDAR_BINS values must "
+            "be distances as shares of the LIDAR's range"
+        )
     for field in ("reward", "danger"):
         values = getattr(steps.outcome, field)
         bad = ~np.isfinite(values)

@@ -11,6 +11,7 @@ from rp_jax.envs.check.pairs import Pairs
 from rp_jax.envs.check.problems import number_of, value_of
 from rp_jax.envs.check.trial import Trial
 
+MARGIN = 0.02  # of the range of a sampled feature, by which visited pairs may be outside
 PAIRS = 512  # that are sampled, and that are visited
 STEPS = 3
 CASES, KEYS = 8, 512  # pairs that are stepped with many keys
@@ -114,6 +115,7 @@ def wrong_samples(trial: Trial) -> list[str]:
                 f"sample of {name} draws {share} for which in_reach is False; it must draw from "
                 "those that are in reach"
             )
+        found += _left_out(trial, pairs, (body, hazard))
         outside, hits = int((hit & ~reach).sum()), int(hit.sum())
         for steps in (trial.steps, trial.placed):
             contact = steps.contacts[kind]
@@ -125,3 +127,26 @@ def wrong_samples(trial: Trial) -> list[str]:
                 "says are hit; what is hit must be in reach"
             )
     return found
+
+
+def _left_out(trial: Trial, pairs: Pairs, sampled: tuple[Any, Any]) -> list[str]:
+    """Returns a sentence if visited pairs in reach have features beyond those of sampled ones."""
+    body, hazard = trial.visited(pairs.kind, PAIRS)
+    if not len(jax.tree.leaves(body)[0]):
+        return []
+    features, _, reach = pairs.look(body, hazard)
+    drawn, features = pairs.features(*sampled), features[reach]
+    low, high = drawn.min(axis=0), drawn.max(axis=0)
+    slack = MARGIN * (high - low) + tolerance_of(drawn, *sampled)
+    outside = (features < low - slack) | (features > high + slack)
+    share = outside.mean(axis=0) if len(features) else np.zeros(1)
+    worst = int(np.argmax(share))
+    if share[worst] <= MARGIN:
+        return []
+    count = number_of(int(outside[:, worst].sum()), len(features), "visited pairs in reach")
+    return [
+        f"sample of the source of {pairs.kind!r} leaves out states that occur: feature {worst} is "
+        f"in [{low[worst]:.6g}, {high[worst]:.6g}] where sampled, and outside in {count}, up to "
+        f"[{features[:, worst].min():.6g}, {features[:, worst].max():.6g}]; it must draw all that "
+        "may be in reach, every speed included"
+    ]

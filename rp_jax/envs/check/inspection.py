@@ -4,7 +4,12 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-from rp_jax.envs.check.bodies import body_disagreements, odd_controls
+from rp_jax.envs.check.bodies import (
+    body_disagreements,
+    hasty_controls,
+    odd_controls,
+    restless_plans,
+)
 from rp_jax.envs.check.dangers import wrong_dangers
 from rp_jax.envs.check.episodes import odd_values, wrong_ends
 from rp_jax.envs.check.features import wrong_features, wrong_samples
@@ -22,6 +27,8 @@ CHECKS: dict[str, Callable[[Trial], list[str]]] = {
     "ends of episodes": wrong_ends,
     "moves of the body": body_disagreements,
     "the baseline policy": odd_controls,
+    "plans": restless_plans,
+    "delayed controls": hasty_controls,
     "static hazards": moved_statics,
     "moves of hazards": unlike_moves,
     "features": wrong_features,

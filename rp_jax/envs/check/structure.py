@@ -143,11 +143,16 @@ def _observation_problems(env: Any, params: Any, state: Any) -> list[str]:
     seen, found = shape_of("observe", env.observe, state, params)
     if seen is None:
         return found
+    if hasattr(env, "threshold"):
+        x, problems = shape_of("threshold", env.threshold, state)
+        found += problems if x is None else scalar("threshold(state)", x, "floating")
     flat = getattr(seen, "ndim", None) == 1 and seen.shape[0] >= 1
     if not flat or not jnp.issubdtype(seen.dtype, jnp.floating):
         text = described(seen) if hasattr(seen, "dtype") else type(seen).__name__
         return [f"observe returns {text}; it must return a flat array of floats"]
     size, bins, scale = seen.shape[0], optional.lidar_bins(env), optional.scale(env)
+    if not isinstance(scale, list | tuple | np.ndarray) or np.ndim(scale) != 1:
+        return [f"SCALE is {shown(scale)}; it must be a tuple of numbers, or be left out"]
     whole = isinstance(bins, int | np.integer) and not isinstance(bins, bool)
     if not whole or bins < 0 or bins % 8 or bins > size:
         return [

@@ -43,6 +43,7 @@ class Steps(struct.PyTreeNode):
     outcome: Any
     modelled: Any  # bodies, from the body's model
     infinite: Any  # int32 index of the first observed value that is not finite, else -1
+    scan: Any  # int32 index of the first LIDAR value outside [0, 1], else -1
     contacts: dict[str, Contact]  # by kind
     collisions: dict[str, Any]  # by kind; empty if the environment does not tell
     clearance: Any  # () under plans, else 0
@@ -53,8 +54,12 @@ def replaced(tree: Any, **fields: Any) -> Any:
 
     Args:
         tree: the state, a dataclass or a named tuple.
-        **fields: the values, by name.
+        **fields: the values, by name; what is no field, but computed from others, stays.
     """
+    own = set(getattr(tree, "_fields", ()))
+    if dataclasses.is_dataclass(tree):
+        own |= {field.name for field in dataclasses.fields(tree)}
+    fields = {name: value for name, value in fields.items() if name in own or not own}
     if hasattr(tree, "replace"):
         return tree.replace(**fields)
     if hasattr(tree, "_replace"):
@@ -90,6 +95,7 @@ class Trial:
         self.find = Batched(lambda params, state: env.hazards(self.thaw(state), params))
         self.find_moving = Batched(self._moving)
         self.move = Batched(_move)
+        self._control = Batched(_planned)
         self._advance = Batched(self._look, whole=True)
 
     def thaw(self, state: Any) -> Any:
@@ -122,16 +128,18 @@ class Trial:
         )
 
         def row(before: Any, action: Array, reached: Any) -> tuple[Any, ...]:
-            seen = ~jnp.isfinite(env.observe(reached, params))
-            bad = jnp.where(jnp.any(seen), jnp.argmax(seen), -1)
+            seen = env.observe(reached, params)
+            bad = _first(~jnp.isfinite(seen))
+            scan = seen[: optional.lidar_bins(env)]
+            odd = _first((scan < 0) | (scan > 1))
             told = env.collisions(reached, params) if hasattr(env, "collisions") else {}
             left = jnp.zeros(())
             if self.plans:
                 left = env.clearance(reached.body.position, params)
             moved = params.body.step(before.body, params.body.control(action))
-            return moved, bad, contacts(env, before, reached, params), told, left
+            return moved, bad, odd, contacts(env, before, reached, params), told, left
 
-        modelled, infinite, met, told, left = jax.vmap(row)(before, actions, reached)
+        modelled, infinite, scan, met, told, left = jax.vmap(row)(before, actions, reached)
         return Steps(
             keys=keys,
             before=states,
@@ -141,6 +149,7 @@ class Trial:
             outcome=outcome,
             modelled=modelled,
             infinite=infinite,
+            scan=scan,
             contacts=met,
             collisions=told,
             clearance=left,
@@ -168,6 +177,17 @@ class Trial:
         choice = np.zeros(count) if choice is None else choice
         steps, keys = np.full(count, k, np.int32), self.draws.keys(count)
         return self.move(self.params, bodies, actions, steps, keys, choice.astype(np.float32))
+
+    def control(self, bodies: Any, k: int, choice: np.ndarray) -> Any:
+        """Returns the controls of plans in bodies (n, ...).
+
+        Args:
+            bodies: where they are.
+            k: step of the plan, counted after the first action.
+            choice: (n,) in [0, 1), which of several plans is followed.
+        """
+        steps = np.full(len(choice), k, np.int32)
+        return self._control(self.params, bodies, steps, choice.astype(np.float32))
 
     @functools.cached_property
     def steps(self) -> Steps:
@@ -243,17 +263,28 @@ class Trial:
         return take(steps.before.body, rows[where]), hazards
 
 
+def _first(bad: Array) -> Array:
+    """Returns the index of the first true value, () int32; -1 if there is none."""
+    if not bad.shape[0]:
+        return jnp.full((), -1, jnp.int32)
+    return jnp.where(jnp.any(bad), jnp.argmax(bad), -1).astype(jnp.int32)
+
+
 def _move(params: Any, body: Any, action: Array, k: Array, key: Any, choice: Array) -> Any:
     """A step of the body's model under an action (k < 0), or step k of the baseline policy."""
     model = params.body
     control = model.control(action)
     if isinstance(model.baseline, Plans):
-        plans = model.baseline
-        index = (choice * len(plans.target)).astype(jnp.int32)
-        rows = {name: getattr(plans, name)[index] for name in ("rotation", "target", "steps")}
-        one = plans.replace(**rows)
-        other = one.control(k, body.speed)
+        other = _planned(params, body, k, choice)
     else:
         other = model.baseline.act(body, model.baseline.draw(typed(key)))
     chosen = jax.tree.map(lambda a, b: jnp.where(k < 0, a, b), control, other)
     return model.step(body, chosen)
+
+
+def _planned(params: Any, body: Any, k: Array, choice: Array) -> Any:
+    """Returns the control of step k of one of several plans."""
+    plans = params.body.baseline
+    index = (choice * len(plans.target)).astype(jnp.int32)
+    rows = {name: getattr(plans, name)[index] for name in ("rotation", "target", "steps")}
+    return plans.replace(**rows).control(k, body.speed)

@@ -48,12 +48,14 @@ def small_windows(trial: Trial) -> list[str]:
 def _outward(pairs: Pairs) -> tuple[Any, Any]:
     """Sampled pairs whose relative position is stretched until they are just out of reach."""
     body, hazard = pairs.sample(STARTS)
+    position = getattr(body, "position", None)
+    axes = 2 if position is None else position[0].size
     features = pairs.features(body, hazard)
     tolerance = tolerance_of(features, body, hazard)
     chosen, stretched = np.zeros(STARTS, bool), features.copy()
     for factor in FACTORS:
         moved = features.copy()
-        moved[:, :2] *= factor
+        moved[:, :axes] *= factor
         seen, _, reach = pairs.look(*pairs.restore(moved))
         new = ~reach & ~beyond(seen, moved, tolerance * factor) & ~chosen
         stretched[new] = moved[new]
