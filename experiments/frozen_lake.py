@@ -5,7 +5,7 @@ python -m experiments.frozen_lake
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import tyro
 from rp_jax import storage
 from rp_jax.cli import errors, terminal
 from rp_jax.cli.experiment import default_out
+from rp_jax.runs.train import can_draw
 from rp_jax.tabular import exact, frozen_lake, oracle, secure, thresholds
 from rp_jax.tabular.cmdp import FiniteCMDP
 from rp_jax.validate import number
@@ -35,7 +36,7 @@ class Config:
     curve: tuple[float, ...] = (0.002, 0.005, 0.02, 0.03, 0.07, 0.15, 0.3, 0.5)  # also in figures
     slip: float = 2 / 3  # probability of moving sideways
     program: bool = True  # solve one linear program per lake, as a check of the optimum
-    figures: bool = True  # draw; needs matplotlib
+    figures: bool = field(default_factory=can_draw)  # draw, with matplotlib
 
     def validate(self) -> None:
         """Raises ValueError, naming the field, if a value is out of range."""
@@ -234,7 +235,7 @@ def main() -> None:
     config = tyro.cli(Config, description=__doc__)
     with errors.bad_input():
         config.validate()
-        errors.needs_matplotlib(config.figures, errors.NO_FIGURES)
+        errors.needs_matplotlib(config.figures)
         folder = storage.new_folder(config.out or default_out("frozen_lake-exact"))
     with jax.enable_x64(True):
         results = run(config)

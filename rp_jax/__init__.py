@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rp_jax.envs.check import EnvError, check_env
     from rp_jax.envs.contract import Env, Hazards, Outcome
     from rp_jax.hazards.source import HazardSource, SubRMDP
+    from rp_jax.planning.dqn import DQNConfig
     from rp_jax.planning.loop import LoopConfig
     from rp_jax.planning.pmdp import PMDP
     from rp_jax.runs.agents import Agent, Agents
@@ -26,14 +27,17 @@ if TYPE_CHECKING:
     from rp_jax.runs.saved import load, save
     from rp_jax.runs.tables import Table
     from rp_jax.threat.build import ThreatConfig
+    from rp_jax.threat.fit import FitConfig
     from rp_jax.threat.function import ThreatFunction
 
 _HOMES = {
     "Agent": "rp_jax.runs.agents",
     "Agents": "rp_jax.runs.agents",
     "Certificate": "rp_jax.runs.certify",
+    "DQNConfig": "rp_jax.planning.dqn",
     "Env": "rp_jax.envs.contract",
     "EnvError": "rp_jax.envs.check",
+    "FitConfig": "rp_jax.threat.fit",
     "HazardSource": "rp_jax.hazards.source",
     "Hazards": "rp_jax.envs.contract",
     "LoopConfig": "rp_jax.planning.loop",
@@ -57,8 +61,10 @@ __all__ = [
     "Agent",
     "Agents",
     "Certificate",
+    "DQNConfig",
     "Env",
     "EnvError",
+    "FitConfig",
     "HazardSource",
     "Hazards",
     "LoopConfig",

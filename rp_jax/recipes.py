@@ -95,4 +95,3 @@ PAPER_PLANNING = LoopConfig(
     prioritised=True,
     explore_share=1.0,
 )
-RECIPES = ("tuned", "paper")  # the first is the default

@@ -55,15 +55,6 @@ class Step(NamedTuple):
     outcome: Outcome
 
 
-def ended(outcome: Outcome) -> Array:
-    """Returns whether an episode is over, for either reason, (B,) bool.
-
-    Args:
-        outcome: of its last step.
-    """
-    return outcome.done
-
-
 def rollout(
     key: Array,
     world: Playable,
@@ -74,7 +65,7 @@ def rollout(
     *,
     alive: Array | None = None,
     stop: Callable[[Array, Any], Array] | None = None,
-    over: Callable[[Outcome], Array] = ended,
+    over: Callable[[Outcome], Array] = lambda outcome: outcome.done,
     steps: int | None = None,
 ) -> tuple[Any, Carry]:
     """Plays episodes side by side, and folds over their steps.

@@ -62,13 +62,12 @@ def plan_test(c: float, confidence: float, expected: float, power: float) -> tup
         ValueError: a value is out of range, or more than `MOST` trials are needed.
     """
     _check_confidence(confidence)
-    number("c", c, above=0)
-    number("expected", expected, least=0)
-    number("power", power, above=0)
-    if not expected < c < 1 or power >= 1:
+    for name, value in (("c", c), ("power", power)):
+        if number(name, value, above=0) >= 1:
+            raise ValueError(f"{name} is {value!r}; it must be a number above 0 and below 1")
+    if number("expected", expected, least=0) >= c:
         raise ValueError(
-            f"expected is {expected!r}, c is {c!r} and power is {power!r}; they must keep "
-            "0 <= expected < c < 1 and 0 < power < 1"
+            f"expected is {expected!r}; it must be a number from 0 on that is less than c, {c!r}"
         )
 
     def power_of(k: int) -> float:
@@ -77,7 +76,11 @@ def plan_test(c: float, confidence: float, expected: float, power: float) -> tup
     low, high = -1, 0  # `low` events are too few; at the end `high` are enough
     while power_of(high) < power:
         low, high = high, 2 * high + 1
-        number("expected: episodes needed", _trials(high, c, confidence), most=MOST)
+        if (trials := _trials(high, c, confidence)) > MOST:
+            raise ValueError(
+                f"c is {c!r} and expected is {expected!r}; to tell them apart takes {trials:,} or "
+                f"more episodes; it must take {MOST:,} at most: c must be greater or expected less"
+            )
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if power_of(middle) >= power else (middle, high)

@@ -62,6 +62,8 @@ def test_a_cluster_that_is_none_is_refused(monkeypatch):
             monkeypatch.delenv(name)
     with pytest.raises(ValueError, match="devices is 'cluster'; it must be started by"):
         devices.connect("cluster")
+    with pytest.raises(ValueError, match="devices is 'cluster'; it must be started by"):
+        devices.mesh_of("cluster")  # as of a call that was not told to connect before
 
 
 def test_without_a_mesh_all_is_as_ever():

@@ -16,7 +16,7 @@ def test_there_are_recipes_of_threats_and_a_planner():
     assert len(CONFIGS) == 7
 
 
-def test_hazards_that_stay_have_one_recipe_and_those_that_move_another():
+def test_threats_that_are_enumerated_have_one_recipe_and_those_that_are_sampled_another():
     kinds = {
         **{f"jam {kind}": sub for kind, sub in jam.sub_rmdps(jam.make_params(1)).items()},
         **circuit.sub_rmdps(circuit.make_params("circle")),
@@ -28,7 +28,7 @@ def test_hazards_that_stay_have_one_recipe_and_those_that_move_another():
         "jam wall": True,
         "jam obstacle": False,
         "wall": True,
-        "bomb": True,
+        "bomb": False,  # it stays, but its rollouts are too many to be enumerated
         "pit": True,
     }
 

@@ -134,7 +134,7 @@ def test_a_test_that_takes_millions_of_events_is_planned_at_once_or_refused():
     n, k = plan_test(1e-3, 0.99, 9.9e-4, 0.9)
     assert 1e8 < n < 2e9
     assert k > 1e5
-    with pytest.raises(ValueError, match=r"^expected: episodes needed is .* at most 2e\+09"):
+    with pytest.raises(ValueError, match=r"^c is .* episodes; it must take 2,000,000,000 at most"):
         plan_test(1e-3, 0.99, 9.999e-4, 0.9)
 
 

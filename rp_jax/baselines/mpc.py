@@ -19,7 +19,7 @@ from rp_jax.envs.contract import Env
 from rp_jax.hazards import is_static
 from rp_jax.planning.percept import Percept
 from rp_jax.planning.pmdp import PMDP
-from rp_jax.validate import number
+from rp_jax.validate import number, shown
 
 UNSAFE = 1e4  # subtracted above the limit of danger; more than any reward within a horizon
 SAME = 1e-4  # scores that differ by less are equal up to rounding
@@ -28,7 +28,11 @@ LOTS = 0x107  # seed for the choice among equally good actions
 
 
 class Model(Env, Protocol):
-    """An environment that is deterministic without its moving hazards."""
+    """An environment that is deterministic without its moving hazards.
+
+    The source of each kind that moves has `behaviour`, the `ControlDistribution` whose controls its
+    `step` takes as noise.
+    """
 
     def without_moving_hazards(self, state: Any) -> Any:
         """Returns a state without the hazards that move.
@@ -80,8 +84,19 @@ def make_search(
         limit: greatest danger of a sequence that counts as safe; with infinity danger only costs.
 
     Raises:
-        ValueError: a value is out of range.
+        ValueError: a value is out of range, or the model lacks what the search needs.
     """
+    if not hasattr(model, "without_moving_hazards"):
+        raise ValueError(
+            f"model is {shown(model)}; it must have without_moving_hazards(state), which returns "
+            "the state without the hazards that move"
+        )
+    for kind, sub in model.sub_rmdps(params).items():
+        if not (is_static(sub.source) or hasattr(sub.source, "behaviour")):
+            raise ValueError(
+                f"source of {kind!r} has no `behaviour`; it must have one, the ControlDistribution "
+                "whose controls its `step` takes as noise: the search follows each of them"
+            )
     number("horizon", horizon, least=1, most=6, integer=True)
     number("penalty", penalty, least=0)
     number("limit", limit, least=0, infinite=True)

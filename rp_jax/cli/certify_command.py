@@ -17,13 +17,13 @@ import tyro
 import rp_jax
 from rp_jax import storage
 from rp_jax.cli import errors, terminal
-from rp_jax.cli.choice import Choice, chosen
+from rp_jax.cli.choice import AgentChoice, chosen
 from rp_jax.runs.certify import certify
 from rp_jax.validate import number
 
 
 @dataclass(frozen=True, kw_only=True)
-class CertifyOptions(Choice):
+class CertifyOptions(AgentChoice):
     """Options of `rp-jax certify`."""
 
     c: float  # crash rate not to be exceeded

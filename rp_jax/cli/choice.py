@@ -18,19 +18,29 @@ from rp_jax.validate import number
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """Options that name an agent, a test, and what is drawn in it."""
+    """Options that name the agents of a run, a test, and what is drawn in it."""
 
     run: Path  # folder of a finished run, or of agents that were saved
     env: str = ""  # module of the world, such as my_package.world; default: that of the run
     variant: str = ""  # a test of the run, such as N=8; default: its first, if it has any
     set: tuple[str, ...] = ()  # KEY=VALUE, settings of the world other than those of the test
-    agent: int = 0  # which of the run's agents, counted from 0
     seed: int = 0  # of the episodes
 
     def validate(self) -> None:
         """Raises ValueError, naming the field, if a value is out of range."""
-        number("agent", self.agent, least=0, integer=True)
         number("seed", self.seed, least=0, most=2**31 - 1, integer=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentChoice(Choice):
+    """Options that name one agent of a run, a test, and what is drawn in it."""
+
+    agent: int = 0  # which of the run's agents, counted from 0
+
+    def validate(self) -> None:
+        """Raises ValueError, naming the field, if a value is out of range."""
+        super().validate()
+        number("agent", self.agent, least=0, integer=True)
 
 
 class Chosen(NamedTuple):
@@ -94,7 +104,8 @@ def chosen(choice: Choice) -> Chosen:
     agents = saved.load(choice.run, env)
     if not isinstance(agents, Agents):
         raise ValueError(f"run is {choice.run}; it must have agents, but holds a threat function")
-    number("agent", choice.agent, least=0, most=len(agents) - 1, integer=True)
+    if isinstance(choice, AgentChoice):
+        number("agent", choice.agent, least=0, most=len(agents) - 1, integer=True)
     variant, name = choice.variant, short_name(agents.pmdp.env)
     if (choice.run / "config.json").exists():
         world = world_of(choice.run, agents.pmdp.env)

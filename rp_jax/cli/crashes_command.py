@@ -18,17 +18,18 @@ import tyro
 
 from rp_jax import storage
 from rp_jax.cli import errors, terminal
-from rp_jax.cli.choice import Choice, Chosen, chosen
+from rp_jax.cli.choice import AgentChoice, Chosen, chosen
 from rp_jax.runs.crashes import CrashConfig, look_at_crashes
+from rp_jax.runs.train import can_draw
 
 
 @dataclass(frozen=True, kw_only=True)
-class CrashesOptions(Choice):
+class CrashesOptions(AgentChoice):
     """Options of `rp-jax crashes`."""
 
     out: Path  # new folder for the results
     sizes: Annotated[CrashConfig, tyro.conf.arg(name="")] = field(default_factory=CrashConfig)
-    figures: bool = True
+    figures: bool = field(default_factory=can_draw)  # draw a figure, with matplotlib
 
     def validate(self) -> None:
         """Raises ValueError, naming the field, if a value is out of range."""
@@ -98,8 +99,9 @@ def main(argv: Sequence[str]) -> None:
     config = tyro.cli(CrashesOptions, args=list(argv), prog="rp-jax crashes", description=__doc__)
     with errors.bad_input():
         config.validate()
-        errors.needs_matplotlib(config.figures, errors.NO_FIGURES)
         found = chosen(config)
+        errors.needs_matplotlib(config.figures)
+        errors.without_figures(config.figures)
         folder = storage.new_folder(config.out)
         storage.write_json(folder / "config.json", dataclasses.asdict(config))
         show(run(config, found, folder))

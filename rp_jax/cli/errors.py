@@ -1,6 +1,5 @@
 """How commands end: messages and exit codes in place of tracebacks."""
 
-import importlib.util
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -11,8 +10,7 @@ from typing import Any
 from rp_jax import storage
 from rp_jax.cli.terminal import say
 from rp_jax.runs import record
-
-NO_FIGURES = ", or say --no-figures"
+from rp_jax.runs.train import can_draw
 
 
 @contextmanager
@@ -74,22 +72,33 @@ def _terminated_as_interrupted() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def needs_matplotlib(figures: bool = True, otherwise: str = "") -> None:
+def needs_matplotlib(figures: bool = True) -> None:
     """Raises ValueError if figures are wanted and cannot be drawn.
 
     Args:
         figures: whether they are wanted.
-        otherwise: how to do without, for the message.
     """
-    if figures and importlib.util.find_spec("matplotlib") is None:
-        raise ValueError(f"figures need matplotlib (pip install 'rp_jax[plot]'){otherwise}")
+    if figures and not can_draw():
+        raise ValueError("figures is True; without matplotlib it must be False (--no-figures)")
+
+
+def without_figures(figures: bool) -> None:
+    """Says how to get figures, if none are drawn since matplotlib is missing.
+
+    Args:
+        figures: whether they are drawn.
+    """
+    if not figures and not can_draw():
+        say("no figures: matplotlib is not installed (pip install 'rp_jax[plot]')")
 
 
 def needs_folder(out: Path | None) -> None:
-    """Raises ValueError if a file that is written at the end could not be.
+    """Raises ValueError if a file that is written at the end could not be, or is there already.
 
     Args:
         out: the file; None: nothing is written.
     """
+    if out is not None and out.exists():
+        raise ValueError(f"out is {out}; it must be a new file, but this exists")
     if out is not None and not out.parent.is_dir():
         raise ValueError(f"out is {out}; its folder must exist")

@@ -21,7 +21,7 @@ from rp_jax.validate import number
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions(Choice):
-    """Options of `rp-jax evaluate`; all agents are evaluated, whatever `agent` is."""
+    """Options of `rp-jax evaluate`, which evaluates all agents of a run."""
 
     episodes: int = 10_000  # of each agent
     penalty: float = 0.0  # taken off the returns per unit of danger

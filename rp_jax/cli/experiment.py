@@ -96,9 +96,10 @@ def _begun(experiment: Experiment, argv: list[str]) -> Run:
     preset = experiment.presets[one_of("preset", chosen.preset, experiment.presets)]
     default = preset(one_of("recipe", chosen.recipe, experiment.recipes))
     config, process = parsed(default, rest, experiment.name, _description(experiment))
-    errors.needs_matplotlib(process.figures, errors.NO_FIGURES)
     world, threats = experiment.make_world(config), threats_of(config)
     train.checked(world, config, threats, process)
+    errors.needs_matplotlib(process.figures)
+    errors.without_figures(process.figures)
     if devices.is_first():
         name = f"{world.name}-{chosen.preset}"
         folder = storage.new_folder(process.out or default_out(name))

@@ -20,14 +20,14 @@ import tyro
 
 from rp_jax import statistics, storage
 from rp_jax.cli import errors, terminal
-from rp_jax.cli.choice import Choice, Chosen, chosen
+from rp_jax.cli.choice import AgentChoice, Chosen, chosen
 from rp_jax.runs import rare_events
 from rp_jax.runs.rare_events import RareConfig
 from rp_jax.streams import Stream, key_of
 
 
 @dataclass(frozen=True, kw_only=True)
-class RareOptions(Choice):
+class RareOptions(AgentChoice):
     """Options of `rp-jax rare`."""
 
     out: Path  # new folder for the results

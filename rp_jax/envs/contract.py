@@ -64,7 +64,9 @@ class Env(Protocol):
                                       learners; 1 by default
         make_params(**settings)       parameters from settings, so that saved agents can be
                                       loaded by the environment's name alone
-        without_moving_hazards(state) the state without moving hazards, for model predictive control
+        without_moving_hazards(state) the state without moving hazards, for model predictive
+                                      control, which also needs a `behaviour` of the sources of
+                                      those that move (`rp_jax.baselines.mpc.Model`)
         mixed_start(key, start, fresh)  a start state with some parts of `start` and the others of
                                       `fresh`, both drawn by `reset`, such that `reset` may draw it
                                       too: the search for starts of rare crashes tries them; by

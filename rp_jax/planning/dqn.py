@@ -28,16 +28,27 @@ class Transition(NamedTuple):
 
 @dataclass(frozen=True)
 class DQNConfig:
-    """Hyperparameters of the learner."""
+    """Hyperparameters of the learner.
 
-    gamma: float = 0.95  # discount of reward
-    learning_rate: float = 3e-3  # Adam's learning rate
-    epsilon: float = 1e-8  # Adam's epsilon
-    anneal: bool = True  # let the learning rate fall to a tenth
-    polyak: float = 0.01  # step size of the target network; 0: copy it every `period` updates
-    period: int = 1000  # updates between copies of the target network
-    reward_scale: float = 0.1  # factor of the rewards
-    masked_target: bool = True  # maximum over admissible actions; False: over all actions
+    Attributes:
+        gamma: discount of reward.
+        learning_rate: Adam's learning rate.
+        epsilon: Adam's epsilon.
+        anneal: let the learning rate fall to a tenth.
+        polyak: step size of the target network; 0: copy it every `period` updates.
+        period: updates between copies of the target network.
+        reward_scale: factor of the rewards.
+        masked_target: maximum over admissible actions; False: over all actions.
+    """
+
+    gamma: float = 0.95
+    learning_rate: float = 3e-3
+    epsilon: float = 1e-8
+    anneal: bool = True
+    polyak: float = 0.01
+    period: int = 1000
+    reward_scale: float = 0.1
+    masked_target: bool = True
 
     def validate(self, name: str) -> None:
         """Raises ValueError, naming the field after `name`, if a value is out of range."""

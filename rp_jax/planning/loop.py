@@ -24,23 +24,41 @@ from rp_jax.validate import finite, none_bad, number, one_of, random_key
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """Sizes and schedules of the loop."""
+    """Sizes and schedules of the loop.
 
-    network: str = "tuned"  # or "paper"
+    Attributes:
+        network: "tuned", or "paper".
+        learner: settings of double DQN.
+        steps: agent steps in all.
+        num_envs: environments that step side by side.
+        batch: replayed transitions per update.
+        updates: gradient steps per step of all environments.
+        n_step: rewards in a learning target.
+        replay: transitions kept.
+        replay_start: transitions kept before learning begins.
+        prioritised: replay transitions with large errors more often.
+        priority_exponent: exponent of the errors, if prioritised.
+        importance: exponent of the importance weights; rises to 1 at the end.
+        explore_from: probability of a random admissible action, at first.
+        explore_to: its probability after `explore_share` of the steps.
+        explore_share: share of the steps over which exploration falls.
+    """
+
+    network: str = "tuned"
     learner: DQNConfig = field(default_factory=DQNConfig)
-    steps: int = 1_200_000  # agent steps in all
-    num_envs: int = 256  # environments that step side by side
-    batch: int = 1024  # replayed transitions per update
-    updates: int = 1  # per step of all environments
-    n_step: int = 3  # rewards in a learning target
-    replay: int = 200_000  # transitions kept
-    replay_start: int = 5_000  # transitions kept before learning begins
-    prioritised: bool = False  # replay transitions with large errors more often
-    priority_exponent: float = 0.6  # of the errors, if prioritised
-    importance: float = 0.4  # exponent of the importance weights; rises to 1 at the end
-    explore_from: float = 1.0  # probability of a random admissible action, at first
-    explore_to: float = 0.05  # the same after `explore_share` of the steps
-    explore_share: float = 0.3  # of the steps, over which exploration falls
+    steps: int = 1_200_000
+    num_envs: int = 256
+    batch: int = 1024
+    updates: int = 1
+    n_step: int = 3
+    replay: int = 200_000
+    replay_start: int = 5_000
+    prioritised: bool = False
+    priority_exponent: float = 0.6
+    importance: float = 0.4
+    explore_from: float = 1.0
+    explore_to: float = 0.05
+    explore_share: float = 0.3
 
     def validate(self, name: str) -> None:
         """Raises ValueError, naming the field after `name`, if a value is out of range."""

@@ -17,8 +17,10 @@ from rp_jax.evaluation import action_values, shielded
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.planning.percept import Percept
 from rp_jax.planning.pmdp import PMDP
+from rp_jax.runs.record import short_name
 from rp_jax.shield import rounded_down
 from rp_jax.threat.function import ThreatFunction
+from rp_jax.validate import shown
 
 
 class Member(NamedTuple):
@@ -52,8 +54,21 @@ class Agent(struct.PyTreeNode):
 
         Returns:
             () or (B,) int.
+
+        Raises:
+            ValueError: they are no states.
         """
+        times: Any = getattr(states, "time", None)
+        if not hasattr(states, "body") or times is None or jnp.ndim(times) > 1:
+            raise ValueError(
+                f"states is {shown(states)}; it must be states of the environment, as reset and "
+                "step return them, one or with one leading axis"
+            )
         return _acted(self, states)
+
+    def __repr__(self) -> str:
+        who = f"RP, x = {self.pmdp.x}" if self.pmdp.shielded else "without a shield"
+        return f"Agent({short_name(self.pmdp.env)}: {who})"
 
     def look(self, states: Any) -> Percept:
         """Returns what is seen in states, the threat of each action, and which are admissible.
@@ -92,6 +107,10 @@ class Agents(Sequence[Agent]):
 
     def __len__(self) -> int:
         return len(self.members)
+
+    def __repr__(self) -> str:
+        which = ", ".join(dict.fromkeys(self.methods))
+        return f"Agents({short_name(self.pmdp.env)}: {len(self)} of {which})"
 
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):

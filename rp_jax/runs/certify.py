@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -10,10 +11,10 @@ from jax import Array
 
 from rp_jax import evaluation, statistics
 from rp_jax.envs.contract import Env
+from rp_jax.runs import record
 from rp_jax.runs.agents import Agents
 from rp_jax.runs.evaluate import ROUND, checked_agents, greedily
 from rp_jax.runs.progress import OnProgress, silent
-from rp_jax.runs.record import short_name
 from rp_jax.streams import Stream, key_of
 from rp_jax.validate import number, random_key
 
@@ -64,6 +65,7 @@ def certify(
     confidence: float = 0.99,
     expected: float | None = None,
     agent: int = 0,
+    folder: str | Path | None = None,
     on_plan: Callable[[int, int], None] | None = None,
     on_progress: OnProgress = silent,
 ) -> Certificate:
@@ -80,6 +82,7 @@ def certify(
         confidence: of the statement.
         expected: crash rate that shall pass with a probability of 90 %; half of c by default.
         agent: which of them, counted from 0.
+        folder: where checkpoints are kept meanwhile; the same call goes on after an interruption.
         on_plan: called with (episodes, crashes allowed) before any is played.
         on_progress: called with (stage, done, total, note).
 
@@ -102,18 +105,34 @@ def certify(
     def play(key: Array, weights: Any, pmdp: Any) -> evaluation.Episodes:
         return evaluation.play_round(key, pmdp, greedily(agents.network)(weights), size)
 
-    own, rounds, done, crashes = key_of(key, Stream.CERTIFICATE), -(-n // size), 0, 0
-    for i in range(rounds):
+    own, rounds = key_of(key, Stream.CERTIFICATE), -(-n // size)
+
+    def one(i: int, counts: np.ndarray) -> np.ndarray:
+        done, crashes = counts
+        if crashes > allowed:
+            return counts  # it is settled
         found = play(jax.random.fold_in(own, i), subject.weights, pmdp)
         evaluation.check(found, "certify")
         danger = np.asarray(found.danger)[: n - done]
         done, crashes = done + len(danger), crashes + int((danger > 0).sum())
         on_progress("certify", i + 1, rounds, f"{crashes} crashes of {allowed} allowed")
-        if crashes > allowed:
-            break
+        return np.asarray([done, crashes])
+
+    spec = {
+        "env": record.name_of(pmdp.env),
+        "key": record.key_data(key),
+        "agent": record.digest_of((subject.weights, pmdp)),
+        "network": agents.config.network,
+        "episodes": n,
+        "allowed": allowed,
+    }
+    where = None if folder is None else Path(folder)
+    job = {**spec, **record.machine(pmdp.env)} if where is not None else {}
+    with record.job(where, "certify", job) as checkpoints:
+        done, crashes = map(int, checkpoints.loop(np.zeros(2, int), one, rounds))
     shows = crashes <= allowed
     return Certificate(
-        env=short_name(pmdp.env),
+        env=record.short_name(pmdp.env),
         method=agents.methods[agent],
         c=c,
         confidence=confidence,

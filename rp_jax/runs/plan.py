@@ -29,7 +29,7 @@ from rp_jax.shield import rounded_down
 from rp_jax.streams import Stream, key_of, numbered
 from rp_jax.threat import artefact
 from rp_jax.threat.function import ThreatFunction
-from rp_jax.validate import number, one_of, random_key
+from rp_jax.validate import number, one_of, random_key, shown
 
 Several = float | Sequence[float]
 
@@ -74,9 +74,10 @@ def plan(
         learning_penalty_from: what the penalty begins with; it grows until half-way.
         insecure_penalty: taken off the reward per state reached in which no action is admissible.
         penalty: taken off the returns in the history, per unit of danger; nothing is learned of it.
-        folder: new, empty, or holding the threat function, where the agents, their curves and,
+        folder: created if missing, where the agents, their threat function, their curves and,
             while they learn, checkpoints are kept: the same call goes on where it was interrupted,
-            and returns at once what is finished.
+            and returns at once what is finished. Agents or a threat function that another call
+            left there are an error.
         settings: keywords of `env.make_params` that made the parameters, kept in the folder so that
             the agents can be loaded without them.
         devices: "one", "all" or "cluster" (docs/devices.md).
@@ -90,6 +91,8 @@ def plan(
     """
     random_key("key", key)
     config = LoopConfig() if config is None else config
+    if not isinstance(config, LoopConfig):
+        raise ValueError(f"config is {shown(config)}; it must be a LoopConfig")
     config.validate("config")
     one_of("devices", devices, sharing.DEVICES)
     members = members_of(x, learning_penalty, seeds)
@@ -168,6 +171,8 @@ def members_of(
     numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
     for seed in numbers:
         number("seeds", seed, least=0, most=2**31 - 1, integer=True)
+    if len(set(numbers)) < len(numbers):
+        raise ValueError(f"seeds is {shown(numbers)}; each must be there once")
     thresholds, penalties = _listed(x), _listed(learning_penalty)
     if not (numbers and thresholds and penalties):
         raise ValueError("x, learning_penalty and seeds must each have at least one value")

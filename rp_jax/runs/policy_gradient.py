@@ -20,6 +20,7 @@ from rp_jax import storage
 from rp_jax.baselines import actor_critic, cpo, pid_lagrangian
 from rp_jax.baselines.cpo import CPOConfig
 from rp_jax.baselines.pid_lagrangian import PIDConfig
+from rp_jax.baselines.policies import CONTROLS
 from rp_jax.checkpoints import Checkpoints, equal_chunks
 from rp_jax.envs.check import check_contract
 from rp_jax.envs.contract import Env
@@ -126,6 +127,8 @@ def learn_policies(
     number("penalty", penalty, least=0)
     members = members_of(float("inf"), learning_penalty, seeds)
     check_contract(env, params)
+    if config.rollout.policy == "gaussian":
+        _check_continuous(key, env, params)
     pmdp = make_pmdp(env, params, None, x=float("inf"), learning_penalty=learning_penalty)
     spec = {
         "env": record.name_of(env),
@@ -165,6 +168,23 @@ def learn_policies(
             }
             storage.save(where / saved.AGENTS, KIND, policies.weights, about)
     return policies
+
+
+def _check_continuous(key: Array, env: Env, params: Any) -> None:
+    """Raises ValueError unless a world's `step` takes continuous actions."""
+
+    def step(key: Array) -> Any:
+        action = jnp.zeros(CONTROLS)
+        return env.step(key, env.reset(key, params), action, params)
+
+    try:
+        jax.eval_shape(step, key)
+    except Exception as error:  # whatever a world raises
+        raise ValueError(
+            f"config.rollout.policy is 'gaussian'; it must be 'categorical' in "
+            f"{record.name_of(env)}, whose step takes no continuous actions "
+            f"({CONTROLS},): {type(error).__name__}"
+        ) from error
 
 
 def _finished(folder: Path, keys: Array, policies: Policies, spec: Mapping[str, Any]) -> Policies:

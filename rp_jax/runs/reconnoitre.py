@@ -53,9 +53,9 @@ def reconnoitre(
         params: its parameters.
         x: the threshold near which the threat has to be known best; others may be used later.
         config: sizes and settings, of all kinds of hazard or by kind; tuned ones by default.
-        folder: new or empty, where the threat function, its reports and, while it is learned,
-            checkpoints are kept: the same call goes on where it was interrupted, and returns at
-            once what is finished.
+        folder: created if missing, where the threat function, its reports and, while it is
+            learned, checkpoints are kept: the same call goes on where it was interrupted, and
+            returns at once what is finished. What another call left there is an error.
         devices: "one", "all" or "cluster" (docs/devices.md).
         on_progress: called with (stage, done, total, note).
 

@@ -14,6 +14,7 @@ import numpy as np
 import rp_jax
 from rp_jax import storage
 from rp_jax.envs import optional
+from rp_jax.envs.check.structure import FUNCTIONS
 from rp_jax.envs.contract import Env
 from rp_jax.planning import loop
 from rp_jax.planning.loop import LoopConfig
@@ -92,7 +93,7 @@ def load(folder: str | Path, env: Env | None = None, params: Any = None) -> Any:
             f"{AGENTS}/manifest.json and no manifest.json"
         )
     about = artefact.about(folder) if alone else about_agents(folder)
-    world = _world(about) if env is None else env
+    world = _checked_env(_world(about) if env is None else env)
     if alone:
         found = params if params is not None else _made(world, {}, folder)
         return load_threat(folder, world.sub_rmdps(found))
@@ -145,6 +146,16 @@ def imported(name: Any) -> Any:
             f"env is {name!r}, which cannot be imported ({error}); it must be a module, such as "
             "rp_jax.envs.jam"
         ) from error
+
+
+def _checked_env(env: Any) -> Any:
+    """Returns an environment, if it has the functions of one."""
+    for name in FUNCTIONS:
+        if not callable(getattr(env, name, None)):
+            raise storage.StorageError(
+                f"env is {record.name_of(env)}; it must be an environment, but has no `{name}`"
+            )
+    return env
 
 
 def _world(about: Mapping[str, Any]) -> Any:
@@ -279,10 +290,12 @@ def restored_agents(
 
 
 def _history(path: Path) -> list[dict[str, Any]]:
-    """The rows of metrics.jsonl, if it is there."""
+    """Returns the rows of metrics.jsonl, if it is there; nan is null in it."""
+    nan = float("nan")
     try:
-        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-    except (OSError, ValueError, RecursionError) as error:
+        rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+        return [{k: nan if v is None else v for k, v in row.items()} for row in rows]
+    except (OSError, ValueError, AttributeError, RecursionError) as error:
         raise storage.StorageError(f"{path}: cannot be read ({error})") from error
 
 

@@ -1,6 +1,7 @@
 """The whole job for a world: reconnaissance, planning and evaluation, into one folder."""
 
 import dataclasses
+import importlib.util
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -27,6 +28,11 @@ from rp_jax.threat import artefact
 from rp_jax.threat.build import ThreatConfig
 from rp_jax.threat.function import ThreatFunction, load_threat
 from rp_jax.validate import number, one_of, within
+
+
+def can_draw() -> bool:
+    """Returns whether matplotlib is installed, which figures are drawn with."""
+    return importlib.util.find_spec("matplotlib") is not None
 
 
 class World(NamedTuple):
@@ -91,7 +97,7 @@ class Process:
     out: Path | None = None  # folder for results; default: results/WORLD-TIME
     threat: Path | None = None  # folder of a threat function to use again
     devices: str = "one"  # "one"; "all": agents on every device; "cluster": of every process
-    figures: bool = True  # draw figures; needs matplotlib
+    figures: bool = field(default_factory=can_draw)  # draw figures, with matplotlib
 
 
 class RunResult(NamedTuple):
@@ -132,6 +138,10 @@ def checked(
     sharing.divides("seeds", config.seeds, sharing.mesh_of(process.devices))
     for kind, threat in threats.items():
         threat.validate(kind)
+    if process.threat is not None and not config.shield:
+        raise ValueError(
+            f"threat is {process.threat}; without a shield it must not be given: nothing goes by it"
+        )
     params = world.params()
     if not world.tests:
         raise ValueError("tests is {}; the world must have at least one")

@@ -29,17 +29,29 @@ CHUNKS = 20  # parts of a fit; after each one there is a point of its curve, and
 
 @dataclass(frozen=True)
 class ThreatConfig:
-    """Settings for learning the threat function of one kind of hazard."""
+    """Settings for learning the threat function of one kind of hazard.
 
-    states: int = 200_000  # number of labelled start states
-    paths: int = 64  # rollouts per state where the label is not exact
-    exact: bool = True  # label exactly where all rollouts can be enumerated
-    sampling: str = "preferential"  # how start states are drawn: preferential or uniform
-    miss_rate: float = 0.02  # greatest share of unsafe states taken for safe; 1: no calibration
-    confidence: float = 0.95  # confidence that `miss_rate` is kept
-    test_states: int = 2000  # number of fresh states for the report and the calibration
-    test_paths: int = 8192  # rollouts per fresh state where the label is not exact
-    fit: FitConfig = field(default_factory=FitConfig)  # settings of the fit
+    Attributes:
+        states: number of labelled start states.
+        paths: rollouts per state where the label is not exact.
+        exact: label exactly where all rollouts can be enumerated.
+        sampling: how start states are drawn: preferential or uniform.
+        miss_rate: greatest share of unsafe states taken for safe; 1: no calibration.
+        confidence: confidence that `miss_rate` is kept.
+        test_states: number of fresh states for the report and the calibration.
+        test_paths: rollouts per fresh state where the label is not exact.
+        fit: settings of the fit.
+    """
+
+    states: int = 200_000
+    paths: int = 64
+    exact: bool = True
+    sampling: str = "preferential"
+    miss_rate: float = 0.02
+    confidence: float = 0.95
+    test_states: int = 2000
+    test_paths: int = 8192
+    fit: FitConfig = field(default_factory=FitConfig)
 
     def validate(self, name: str) -> None:
         """Raises ValueError, naming the field after `name`, if a value is out of range."""

@@ -22,16 +22,27 @@ class Dataset(NamedTuple):
 
 @dataclass(frozen=True)
 class FitConfig:
-    """Settings for fitting a threat model."""
+    """Settings for fitting a threat model.
 
-    hidden: tuple[int, ...] = (128, 128, 128)  # widths of the network's hidden layers
-    activation: str = "silu"  # relu or silu
-    steps: int = 12_000  # number of gradient steps
-    batch: int = 1024  # states per gradient step
-    learning_rate: float = 3e-3  # Adam's learning rate
-    epsilon: float = 1e-8  # Adam's epsilon
-    cosine: bool = True  # let the rate fall to 0 along a cosine; otherwise it is constant
-    validation: float = 0.05  # share of the states held out for validation
+    Attributes:
+        hidden: widths of the network's hidden layers.
+        activation: relu or silu.
+        steps: number of gradient steps.
+        batch: states per gradient step.
+        learning_rate: Adam's learning rate.
+        epsilon: Adam's epsilon.
+        cosine: let the rate fall to 0 along a cosine; otherwise it is constant.
+        validation: share of the states held out for validation.
+    """
+
+    hidden: tuple[int, ...] = (128, 128, 128)
+    activation: str = "silu"
+    steps: int = 12_000
+    batch: int = 1024
+    learning_rate: float = 3e-3
+    epsilon: float = 1e-8
+    cosine: bool = True
+    validation: float = 0.05
 
     def validate(self, name: str) -> None:
         """Raises ValueError, naming the field after `name`, if a value is out of range."""

@@ -36,6 +36,16 @@ class ThreatFunction:
         name = environment or str(learned_in)
         artefact.save(Path(folder), name, self.models, self.subs, self.about)
 
+    def __repr__(self) -> str:
+        sums = self.about.get("sums", {})
+        parts = [
+            f"{kind} (mean absolute error of sums {sums[kind]['mae']:.2g})"
+            if kind in sums
+            else kind
+            for kind in self.models
+        ]
+        return f"ThreatFunction({', '.join(parts)})"
+
     @property
     def checksum(self) -> str:
         """The SHA-256 of the models and the sub-R-MDPs that they hold for."""

@@ -143,7 +143,7 @@ def test_a_rate_is_shown_or_not_shown_with_the_planned_episodes(finished, tmp_pa
         (["--c", "0"], "c is 0.0"),
         (["--c", "0.1", "--confidence", "1"], "confidence is 1.0"),
         (["--c", "0.1", "--expected", "0.2"], "expected is 0.2"),
-        (["--c", "0.1", "--expected", "0.0999999"], "expected: episodes needed is"),
+        (["--c", "0.1", "--expected", "0.0999999"], "c is 0.1 and expected is 0.0999999"),
         (["--c", "0.1", "--agent", "2"], "agent is 2; it must be"),
         (["--c", "0.1", "--variant", "N=8"], "variant is 'N=8'"),
     ],

@@ -9,8 +9,9 @@ import pytest
 
 from experiments import circuit, jam, point_gather
 from rp_jax import storage
-from rp_jax.cli import experiment
+from rp_jax.cli import errors, experiment
 from rp_jax.runs import train
+from rp_jax.runs.train import Process
 from rp_jax.threat import artefact
 from rp_jax.threat.model import ThreatModel, ThreatNetwork
 
@@ -163,8 +164,8 @@ def test_threats_that_do_not_fit_are_named(refused, tmp_path):
     refused("jam", "--threat", "nowhere", says=says, keeps=keeps)
     says = "hazards are ['obstacle', 'wall']"
     refused("circuit", "--threat", "wide", says=says, keeps=keeps)
-    # It is looked at even where it would not be used.
-    refused("jam", "--no-shield", "--threat", "nowhere", says="manifest.json", keeps=keeps)
+    says = "threat is wide; without a shield it must not be given"
+    refused("jam", "--no-shield", "--threat", "wide", says=says, keeps=keeps)
 
 
 def test_damaged_threats_are_named(refused, tmp_path):
@@ -186,12 +187,25 @@ def test_damaged_threats_are_named(refused, tmp_path):
     refused("circuit", "--threat", "good", says="manifest.json: cannot be read", keeps=["good"])
 
 
-def test_figures_without_matplotlib_are_refused(refused, monkeypatch):
+@pytest.fixture
+def no_matplotlib(monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name: None if name == "matplotlib" else find(name)
     )
-    refused("jam", says=("figures need matplotlib", "or say --no-figures"))
+
+
+def test_figures_without_matplotlib_are_refused_after_all_else(refused, no_matplotlib):
+    refused("jam", "--figures", says="figures is True; without matplotlib it must be False")
+    refused("jam", "--figures", "--x", "nan", says="x is nan")
+
+
+def test_without_matplotlib_figures_are_off(no_matplotlib, capsys):
+    assert not Process().figures
+    errors.without_figures(Process().figures)
+    assert "no figures: matplotlib is not installed" in capsys.readouterr().out
+    errors.without_figures(True)
+    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.parametrize("name", MODULES)

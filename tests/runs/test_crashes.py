@@ -62,6 +62,34 @@ def test_each_crash_has_its_last_steps():
         assert crash.threat.shape == (min(3, crash.length), 3)
 
 
+def test_a_crash_is_a_step_of_danger_whatever_is_being_hit():
+    """As `evaluate` counts: a hazard of the world's own that no source knows is one as well."""
+
+    class Muddy:
+        """The corridor, where the second step is dangerous too, and nothing is hit by it."""
+
+        def __getattr__(self, name):
+            return getattr(probe, name)
+
+        def __hash__(self):
+            return 0
+
+        def __eq__(self, other):
+            return isinstance(other, Muddy)
+
+        def step(self, key, state, action, params):
+            reached, outcome = probe.step(key, state, action, params)
+            danger = jnp.where(state.time == 1, 1.0, outcome.danger)
+            return reached, outcome.replace(danger=danger)
+
+    agent = eager(1.0)
+    agent = agent.replace(pmdp=agent.pmdp.replace(env=Muddy()))
+    found, count, episodes = crashes.found(jax.random.key(0), agent, SIZES)
+    assert count == episodes  # every episode is longer than a step
+    assert {crash.length for crash in found} == {2}
+    assert {tuple(crash.hit) for crash in found} == {()}
+
+
 def test_what_was_risked_and_what_was_missed():
     agent = eager(1.0)  # walks into the pit
     found, _, _ = crashes.found(jax.random.key(0), agent, SIZES)

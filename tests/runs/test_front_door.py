@@ -1,7 +1,9 @@
 """reconnoitre, plan, evaluate, certify, save and load on the corridor of tests/probe.py."""
 
 import dataclasses
+import functools
 import json
+import re
 import subprocess
 import sys
 
@@ -15,6 +17,7 @@ from tiny import programs_of_a_moment  # noqa: F401
 
 import rp_jax
 from rp_jax import LoopConfig, ThreatConfig
+from rp_jax.envs import jam
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.runs.saved import about_agents
 from rp_jax.storage import StorageError
@@ -235,6 +238,104 @@ def test_the_same_call_goes_on_to_the_same_bits_and_is_done_once(params, tmp_pat
     assert len(again.history) == len(alone.history)
 
 
+def test_saving_again_replaces_the_threat_function_too(agents, params, tmp_path):
+    other = rp_jax.reconnoitre(jax.random.key(7), probe, params, config=SMALL, x=0.5)
+    changed = dataclasses.replace(
+        agents, threat=other, pmdp=agents.pmdp.replace(threats=dict(other.models))
+    )
+    for which in (agents, changed):
+        rp_jax.save(tmp_path, which)
+        loaded = rp_jax.load(tmp_path, probe, params)
+        same(loaded.threat.models["pit"].params, which.threat.models["pit"].params)
+        same(loaded.pmdp.threat(STARTS), which.pmdp.threat(STARTS))
+        np.testing.assert_equal(loaded.history, agents.history)
+    agents.threat.save(tmp_path / "threat")  # one of them alone
+    with pytest.raises(
+        StorageError, match=r"checksum is \w+; it must be \w+, that of the one which"
+    ):
+        rp_jax.load(tmp_path, probe, params)
+    with pytest.raises(ValueError, match="it holds a threat function with the checksum"):
+        rp_jax.plan(KEY, probe, params, other, x=0.5, config=LEARNER, folder=tmp_path)
+
+
+def test_a_folder_with_agents_and_a_threat_function_loads_the_agents(agents, params, tmp_path):
+    agents.threat.save(tmp_path)
+    rp_jax.save(tmp_path, agents)
+    assert isinstance(rp_jax.load(tmp_path, probe, params), rp_jax.Agents)
+
+
+def test_what_is_written_says_what_it_is(agents, threat):
+    assert repr(agents) == "Agents(probe: 2 of RP (x=0.5))"
+    assert repr(agents[0]) == "Agent(probe: RP, x = 0.5)"
+    assert re.fullmatch(r"ThreatFunction\(pit \(mean absolute error .* 0\.\d+\)\)", repr(threat))
+    for config in (LoopConfig, ThreatConfig, FitConfig, rp_jax.DQNConfig):
+        for field in dataclasses.fields(config):
+            assert re.search(rf"\n +{field.name}: \S.*\.", config.__doc__), field.name
+
+
+class Wider:
+    """The corridor with an observation that is one number longer."""
+
+    def __getattr__(self, name):
+        return getattr(probe, name)
+
+    @staticmethod
+    def observe(state, params):
+        return jnp.append(probe.observe(state, params), 0.0)
+
+
+class Fewer(Wider):
+    """The corridor with two actions."""
+
+    observe = staticmethod(probe.observe)
+
+    @staticmethod
+    def num_actions(params):
+        return 2
+
+
+@pytest.mark.parametrize(
+    ("world", "says"),
+    [
+        (Wider(), r"length of the observation is \d+; it must be \d+, as where the agents learned"),
+        (Fewer(), r"number of actions is 2; it must be 3"),
+    ],
+)
+def test_a_world_in_which_agents_cannot_act_is_refused(world, says, agents):
+    for call in (rp_jax.evaluate, functools.partial(rp_jax.certify, c=0.5)):
+        with pytest.raises(ValueError, match=says):
+            call(KEY, agents, world)
+
+
+def test_another_horizon_is_another_job(params, tmp_path):
+    rp_jax.reconnoitre(KEY, probe, params, config=SMALL, x=0.5, folder=tmp_path)
+
+    class Longer(Wider):
+        observe = staticmethod(probe.observe)
+        __name__ = "probe"  # the same name, and other sub-R-MDPs
+
+        @staticmethod
+        def sub_rmdps(params):
+            (sub,) = probe.sub_rmdps(params).values()
+            longer = sub.source.replace(horizon=sub.source.horizon + 1)
+            return {"pit": sub.replace(source=longer)}
+
+    with pytest.raises(ValueError, match=r"folder is .*; its params is"):
+        rp_jax.reconnoitre(KEY, Longer(), params, config=SMALL, x=0.5, folder=tmp_path)
+
+
+def test_a_certificate_goes_on_where_it_was_interrupted(agents, tmp_path, monkeypatch):
+    test = functools.partial(rp_jax.certify, KEY, agents, c=0.98, expected=0.975)
+    alone, told = test(), []
+    assert alone.episodes > 2000
+    with stopped_after(1, monkeypatch), pytest.raises(KeyboardInterrupt):
+        test(folder=tmp_path)
+    count = lambda stage, done, total, note: told.append(done)  # noqa: E731
+    assert test(folder=tmp_path, on_progress=count) == alone
+    assert told[0] == 2
+    assert not (tmp_path / "checkpoints").exists()
+
+
 def test_a_folder_of_something_else_is_refused(params, tmp_path, monkeypatch):
     call(tmp_path, params)
     other = probe.make_params(slip=0.3)
@@ -258,6 +359,8 @@ def test_a_folder_of_something_else_is_refused(params, tmp_path, monkeypatch):
         ({"x": float("nan")}, r"^x is nan"),
         ({"seeds": 0}, r"^seeds is 0; it must be an integer, at least 1"),
         ({"seeds": [0, -1]}, r"^seeds is -1"),
+        ({"seeds": [1, 2, 1]}, r"^seeds is \[1, 2, 1\]; each must be there once"),
+        ({"config": SMALL}, r"^config is ThreatConfig.*; it must be a LoopConfig"),
         ({"x": ()}, r"^x, learning_penalty and seeds must each"),
         ({"x": (0.1, 0.2), "learning_penalty": (1.0, 2.0, 3.0)}, r"^learning_penalty has 3 values"),
         ({"lookahead": -1}, r"^lookahead is -1"),
@@ -308,6 +411,23 @@ def test_evaluation_and_saving_name_what_they_are_not_made_for(agents, tmp_path)
         rp_jax.save(tmp_path, 3)
     with pytest.raises(StorageError, match="there is no such folder"):
         rp_jax.load(tmp_path / "nothing", probe)
+    with pytest.raises(ValueError, match="folder is 3; it must be a path"):
+        rp_jax.load(3)
+    with pytest.raises(StorageError, match="it must hold agents or a threat function"):
+        rp_jax.load(tmp_path, probe)
+    (tmp_path / "file").touch()
+    with pytest.raises(StorageError, match="file"):
+        rp_jax.save(tmp_path / "file", agents)
+    for nonsense in (jnp.zeros(3), 0, STARTS.body):
+        with pytest.raises(ValueError, match=r"(?s)states is .*; it must be states of the env"):
+            agents[0].act(nonsense)
+    rp_jax.save(tmp_path / "mine", agents, {"slip": 0.2})
+    with pytest.raises(StorageError, match="env is json; it must be an environment, but has no"):
+        rp_jax.load(tmp_path / "mine", json)
+    with pytest.raises(
+        StorageError, match=r"settings .* do not fit rp_jax\.envs\.jam\.make_params"
+    ):
+        rp_jax.load(tmp_path / "mine", jam)
 
 
 def test_plain_numbers_are_good_scalars(params, threat):

@@ -14,6 +14,7 @@ from rp_jax import storage
 from rp_jax.runs import saved, train
 from rp_jax.runs.progress import silent
 from rp_jax.runs.train import Process
+from rp_jax.streams import Stream, key_of, numbered
 from rp_jax.threat import artefact
 
 PROMISED = [
@@ -139,6 +140,21 @@ def test_the_threat_function_has_its_report(finished):
     assert about["networks"]["wall"]["hidden"] == [16]
     curves = read(finished / "threat" / "curves.json")
     assert curves["wall"][-1]["step"] == 40
+
+
+def test_the_threats_of_a_seed_share_no_key_with_anything_else(monkeypatch, tmp_path):
+    """Neither with those of another seed, nor with planning or evaluation."""
+    keys, world = [], circuit.make_world(circuit.Config())
+    monkeypatch.setattr(train, "reconnoitre", lambda key, *_, **__: keys.append(key))
+    for seed in range(20):
+        config = circuit.Config(seed=seed)
+        train.threat_of(jax.random.key(0), world, config, {}, tmp_path, Process(), silent)
+    root = jax.random.key(0)
+    others = [key_of(root, stream) for stream in Stream]
+    others += [key for stream in Stream for key in numbered(key_of(root, stream), list(range(20)))]
+    mine = [key_of(key, stream) for key in keys for stream in (Stream.THREAT, Stream.SUMS)]
+    words = [tuple(np.asarray(jax.random.key_data(key)).tolist()) for key in [*mine, *others]]
+    assert len(set(words)) == len(words)
 
 
 def test_a_saved_threat_function_serves_another_track_and_threshold(finished, tmp_path):
