@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import json
 import math
@@ -10,6 +11,7 @@ import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from types import CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import jax
@@ -219,21 +221,64 @@ def statics(part: Any, path: str = "") -> dict[str, Any]:
 
 
 def text(value: Any) -> str:
-    """Returns the text of a static value, the same in every process.
+    """Returns the text of a static value, the same in every process, and another for another value.
 
     Args:
-        value: anything. A function is named by its module and name. An object whose text would say
-            where it is in memory is told by its class and its fields.
+        value: numbers and strings have their usual text, and so have lists, tuples and tables of
+            them. Functions are told by their name, code, defaults and closure; objects whose usual
+            text would say where they are in memory by their class and fields; arrays by a checksum.
     """
+    return _text(value, ())
+
+
+def _text(value: Any, above: tuple) -> str:
+    """Returns the text of a value inside others, which may refer back to these."""
+    if any(value is one for one in above):
+        return "..."
+    of = lambda part: _text(part, (*above, value))  # noqa: E731
+    if _is_plain(value):
+        return str(value)
+    if isinstance(value, ModuleType):
+        return value.__name__
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{of(k)}: {of(v)}' for k, v in value.items())}}}"
+    if isinstance(value, set | frozenset):
+        return f"{{{', '.join(sorted(map(of, value)))}}}"
     if isinstance(value, list | tuple):
-        return f"({', '.join(map(text, value))})"
+        return f"({', '.join(map(of, value))})"
+    if isinstance(value, np.ndarray | jax.Array):
+        array = np.asarray(_data(value))
+        return f"{array.dtype}{array.shape} {hashlib.sha256(array.tobytes()).hexdigest()}"
+    if isinstance(value, functools.partial):
+        return f"partial{of((value.func, value.args, value.keywords))}"
+    if isinstance(value, MethodType):
+        return f"{of(value.__func__)} of {of(value.__self__)}"
+    if isinstance(value, FunctionType):
+        cells = [cell.cell_contents for cell in value.__closure__ or ()]
+        parts = (value.__code__, value.__defaults__, value.__kwdefaults__, cells)
+        return f"{value.__module__}.{value.__qualname__}{of(parts)}"
+    if isinstance(value, CodeType):
+        return hashlib.sha256(value.co_code).hexdigest() + of((value.co_consts, value.co_names))
+    if hasattr(value, "__wrapped__"):  # as jax.jit leaves it
+        return f"{type(value).__qualname__}({of(value.__wrapped__)})"
     found = str(value)
     if " at 0x" not in found:
         return found
-    if hasattr(value, "__qualname__"):
-        return f"{value.__module__}.{value.__qualname__}"
-    fields = {name: text(part) for name, part in sorted(getattr(value, "__dict__", {}).items())}
-    return f"{type(value).__module__}.{type(value).__qualname__}{fields}"
+    slots = [name for kind in type(value).__mro__ for name in getattr(kind, "__slots__", ())]
+    fields = {name: getattr(value, name) for name in slots if hasattr(value, name)}
+    fields |= getattr(value, "__dict__", {})
+    if not fields:
+        return found  # nothing is known of it: equal to itself alone
+    return f"{type(value).__module__}.{type(value).__qualname__}{of(fields)}"
+
+
+def _is_plain(value: Any) -> bool:
+    """Returns whether a value is of numbers and strings alone, in lists, tuples and tables."""
+    if isinstance(value, Mapping):
+        return all(map(_is_plain, [*value, *value.values()]))
+    if isinstance(value, list | tuple):
+        return all(map(_is_plain, value))
+    return value is None or isinstance(value, str | int | float | bool | bytes)
 
 
 def _flat(tree: Any) -> dict[str, Any]:
@@ -492,8 +537,8 @@ def _restored(data: memoryview, facts: Mapping[str, Any], like: Any) -> Any:
     """Returns one array from its bytes: a key, a numpy array or a JAX array, as `like` is."""
     dtype = jax.numpy.dtype(facts["dtype"])
     array = np.frombuffer(data, dtype).reshape(facts["shape"]).copy()
-    if isinstance(like, np.ndarray):
-        return array
+    if isinstance(like, np.ndarray | np.generic):
+        return array[()]
     if _is_key(like):
         return jax.random.wrap_key_data(jax.numpy.array(array), impl=jax.random.key_impl(like))
     return jax.numpy.array(array)

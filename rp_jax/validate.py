@@ -3,6 +3,7 @@
 import contextlib
 import math
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
@@ -180,6 +181,21 @@ def shared_length(**trees: Any) -> int:
             raise ValueError(f"{field} is {what}; it must have a leading axis of length {allowed}")
         found = length
     return found
+
+
+def path(field: str, value: Any) -> Path:
+    """Returns a path, and raises ValueError for anything that is none.
+
+    Args:
+        field: name of the value, for the message.
+        value: what the user gave.
+
+    Raises:
+        ValueError: the value is neither text nor a path.
+    """
+    if not isinstance(value, str | Path):
+        raise ValueError(f"{field} is {shown(value)}; it must be a path")
+    return Path(value)
 
 
 def random_key(field: str, key: Any) -> None:

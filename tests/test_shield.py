@@ -12,6 +12,8 @@ from rp_jax.shield import (
     greedy_eta,
     masked_argmax,
     masked_sample,
+    rounded_down,
+    rounded_up,
     shield,
 )
 
@@ -183,3 +185,24 @@ def test_a_mask_of_one_action_leaves_no_choice():
 def test_batches_are_refused_since_all_is_unbatched(use):
     with pytest.raises(ValueError, match=r"; it must be an array of (1|no) axis"):
         use()
+
+
+@pytest.mark.parametrize(
+    ("value", "above", "below"),
+    [
+        (0.5, 0.5, 0.5),  # a float32 number stays
+        (0.1, 0.1, 0.0999999940395355),  # the neighbours of .1 are .09999999404 and .10000000149
+        (1 + 2.0**-40, 1 + 2.0**-23, 1.0),
+        (-0.1, -0.0999999940395355, -0.1),
+        (1e-42, 2.0**-126, 713 * 2.0**-149),  # compiled code takes subnormal numbers for 0
+        (0.0, 0.0, 0.0),
+        (1e39, np.inf, np.finfo(np.float32).max),
+        (np.inf, np.inf, np.inf),
+    ],
+)
+def test_threats_are_rounded_up_and_thresholds_down(value, above, below):
+    for function, wanted in ((rounded_up, above), (rounded_down, below)):
+        found = function(value)
+        assert found.dtype == np.float32
+        assert found == np.float32(wanted)
+    assert float(rounded_down(value)) <= value <= float(rounded_up(value))

@@ -4,7 +4,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from rp_jax.statistics import _trials, clopper_pearson, mean_interval, plan_test, upper_bound
+from rp_jax.statistics import (
+    _trials,
+    clopper_pearson,
+    events_allowed,
+    mean_interval,
+    plan_test,
+    upper_bound,
+)
 
 rates = st.integers(1, 300).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
 
@@ -149,3 +156,20 @@ def test_no_event_in_2995_shows_less_than_a_thousandth():
 def test_a_test_that_cannot_be_planned_is_refused(values):
     with pytest.raises(ValueError, match=r"^(c|expected) is"):
         plan_test(*values)
+
+
+@pytest.mark.parametrize(
+    ("n", "rate", "k"),
+    [
+        (2995, 1e-3, 0),  # 1 - .05^(1 / n) is .99974e-3 with 2,995, 1.00007e-3 with 2,994
+        (2994, 1e-3, -1),
+        (0, 0.5, -1),
+        (59, 0.05, 0),  # .95^59 = .0485
+        (93, 0.05, 1),  # .95^93 + 93 * .05 * .95^92 = .0500 - .0006
+        (92, 0.05, 0),
+    ],
+)
+def test_the_most_events_that_a_bound_allows(n, rate, k):
+    assert events_allowed(n, rate) == k
+    if k >= 0:
+        assert upper_bound(k, n, 0.95) <= rate < upper_bound(k + 1, n, 0.95)

@@ -1,4 +1,5 @@
 import errno
+import functools
 import json
 import os
 import signal
@@ -490,3 +491,92 @@ def test_plain_numbers_are_kept_as_jax_takes_them(tmp_path):
             }
             np.testing.assert_array_equal(found["a"], jnp.asarray(0.1))
     assert storage.leaves(plain)["a"].dtype == jnp.asarray(0.1).dtype
+
+
+class Sized:
+    """An object whose usual text says where it is in memory."""
+
+    def __init__(self, size):
+        self.size = size
+
+    def grown(self):
+        return self.size + 1
+
+
+class Slotted:
+    __slots__ = ("size",)
+
+    def __init__(self, size):
+        self.size = size
+
+
+def adder(n):
+    return lambda value: value + n
+
+
+def ringed(size):
+    one = Sized(size)
+    one.self = one
+    return one
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda n: n,
+        lambda n: ("front", n),
+        lambda n: {"a": [n, None]},
+        lambda n: frozenset({"a", "b", n}),
+        lambda n: np.arange(3000) + n * (np.arange(3000) == 1500),
+        Sized,
+        Slotted,
+        ringed,
+        lambda n: Sized(Sized(n)),
+        lambda n: Sized(n).grown,
+        lambda n: functools.partial(adder, n),
+        lambda n: functools.partial((adder, ringed)[n]),
+        adder,
+        lambda n: {"law": adder(n)},
+        lambda n: jax.jit(adder(n)),
+        lambda n: lambda a, b=n: a + b,
+        lambda n: (lambda a: a + 1) if n else (lambda a: a - 1),
+        lambda n: (lambda a: a + 2) if n else (lambda a: a + 3),
+    ],
+)
+def test_static_values_have_one_text_each(make):
+    zero, again, one = make(0), make(0), make(1)
+    assert storage.text(zero) == storage.text(again) != storage.text(one)
+    assert " at 0x" not in storage.text(zero)
+
+
+def test_texts_of_earlier_files_stay_and_what_is_unknown_equals_itself_alone():
+    for value in (3, 0.25, "released", ("front", 2), (1,), [1, 2], {"a": (1, 2)}, None, True):
+        assert storage.text(value) == str(value)
+    assert storage.text(jax) == "jax"
+    thing, other = object(), object()
+    assert storage.text(thing) == storage.text(thing) != storage.text(other)
+
+
+def test_texts_are_those_of_other_processes():
+    code = (
+        "from rp_jax import storage; from rp_jax.envs import jam; "
+        "print(storage.text((jam.step, frozenset({'a', 'b', 'c'}), jam)))"
+    )
+    texts = {
+        subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, "PYTHONHASHSEED": seed},
+            capture_output=True,
+            check=True,
+        ).stdout
+        for seed in ("1", "2", "3")
+    }
+    assert len(texts) == 1
+
+
+def test_numpy_scalars_come_back_with_their_type(tmp_path):
+    tree = {"a": np.float64(0.1), "b": np.int32(3), "c": 0.5}
+    storage.save(tmp_path, "kind", tree, {})
+    found = storage.load(tmp_path, "kind", tree)
+    assert storage.checksum(found) == storage.checksum(tree)
+    assert found["a"] == np.float64(0.1)

@@ -73,7 +73,7 @@ def world_from(argv: Sequence[str]) -> tuple[World, list[str]]:
     settings, tests = parsed_settings(found.set), {}
     for word in found.test:
         name, colon, changes = word.partition(":")
-        if not colon:
+        if not colon or not name:
             raise ValueError(f"test is {word!r}; it must be NAME:KEY=VALUE,KEY=VALUE")
         tests[name] = {**settings, **parsed_settings(changes.split(",") if changes else [])}
     world = World(record.short_name(env), env, settings, tests or {"": dict(settings)})

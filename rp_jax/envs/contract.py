@@ -10,6 +10,13 @@ from jax import Array
 
 from rp_jax.hazards import SubRMDP
 
+FUNCTIONS = {  # that each environment must have, with their arguments
+    "reset": "(key, params)",
+    "step": "(key, state, action, params)",
+    "observe": "(state, params)",
+    "hazards": "(state, params)",
+    "sub_rmdps": "(params)",
+}
 BASELINES = ("paper", "plans")  # baseline policies that threats may be measured under
 
 

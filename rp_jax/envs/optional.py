@@ -91,7 +91,7 @@ def scale(env: Env) -> tuple[float, ...]:
     Args:
         env: the environment; by default the factors are 1, and the result is ().
     """
-    return getattr(env, "SCALE", ())
+    return tuple(float(factor) for factor in getattr(env, "SCALE", ()))
 
 
 def observation_size(env: Env, params: Any) -> int:

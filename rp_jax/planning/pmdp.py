@@ -167,6 +167,6 @@ class PMDP(struct.PyTreeNode):
         if static is not None:
             static = jnp.repeat(static, self.lookahead, axis=0)
         going = flat(~outcome.terminated)
-        after = jnp.min(self._summed(jax.tree.map(flat, reached), static, going), axis=-1)
-        danger = flat(outcome.danger) + jnp.where(going, after, 0.0)
+        after = self._summed(jax.tree.map(flat, reached), static, going)  # 0 after an end
+        danger = flat(outcome.danger) + jnp.min(after, axis=-1)
         return jnp.mean(danger.reshape(outcome.danger.shape), axis=-1)

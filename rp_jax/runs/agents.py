@@ -12,6 +12,7 @@ from jax import Array
 
 from rp_jax.dynamics import Plans
 from rp_jax.envs import optional
+from rp_jax.envs.check import check_contract
 from rp_jax.envs.contract import Env
 from rp_jax.evaluation import action_values, shielded
 from rp_jax.planning.loop import LoopConfig
@@ -138,6 +139,7 @@ class Agents(Sequence[Agent]):
         there = pmdp.replace(
             env=pmdp.env if env is None else env, params=pmdp.params if params is None else params
         )
+        check_contract(there.env, there.params)
         check_same_interface((pmdp.env, pmdp.params), (there.env, there.params))
         if self.threat is not None:
             self.threat.check_fits(there.env.sub_rmdps(there.params))

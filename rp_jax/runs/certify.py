@@ -13,10 +13,10 @@ from rp_jax import evaluation, statistics
 from rp_jax.envs.contract import Env
 from rp_jax.runs import record
 from rp_jax.runs.agents import Agents
-from rp_jax.runs.evaluate import ROUND, checked_agents, greedily
+from rp_jax.runs.evaluate import ROUND, checked_agents, greedily, spec_of
 from rp_jax.runs.progress import OnProgress, silent
 from rp_jax.streams import Stream, key_of
-from rp_jax.validate import number, random_key
+from rp_jax.validate import number, path, random_key
 
 POWER = 0.9  # of the test, at the expected crash rate
 
@@ -91,11 +91,13 @@ def certify(
         FloatingPointError: an observation, a threat or a reward is not a finite number.
     """
     random_key("key", key)
+    where = None if folder is None else path("folder", folder)
     number("c", c, above=0)
     checked_agents(agents)
     number("agent", agent, least=0, most=len(agents) - 1, integer=True)
     n, allowed = statistics.plan_test(c, confidence, c / 2 if expected is None else expected, POWER)
-    subject = agents.in_world(env, params)[agent]
+    alone = agents.in_world(env, params)[agent : agent + 1]
+    subject = alone[0]
     pmdp = subject.pmdp
     if on_plan is not None:
         on_plan(n, allowed)
@@ -118,16 +120,7 @@ def certify(
         on_progress("certify", i + 1, rounds, f"{crashes} crashes of {allowed} allowed")
         return np.asarray([done, crashes])
 
-    spec = {
-        "env": record.name_of(pmdp.env),
-        "key": record.key_data(key),
-        "agent": record.digest_of((subject.weights, pmdp)),
-        "network": agents.config.network,
-        "episodes": n,
-        "allowed": allowed,
-    }
-    where = None if folder is None else Path(folder)
-    job = {**spec, **record.machine(pmdp.env)} if where is not None else {}
+    job = {} if where is None else {**spec_of(key, alone), "episodes": n, "allowed": allowed}
     with record.job(where, "certify", job) as checkpoints:
         done, crashes = map(int, checkpoints.loop(np.zeros(2, int), one, rounds))
     shows = crashes <= allowed

@@ -22,7 +22,7 @@ from rp_jax.runs.agents import Agent, Agents, Member, side_by_side, with_member
 from rp_jax.runs.progress import OnProgress, silent
 from rp_jax.runs.tables import Table
 from rp_jax.streams import Stream, key_of, numbered
-from rp_jax.validate import number, one_of, random_key, shown
+from rp_jax.validate import number, one_of, path, random_key, shown
 
 ROUND = 1000  # episodes of an agent side by side
 
@@ -67,25 +67,35 @@ def evaluate(
     one_of("devices", devices, sharing.DEVICES)
     several = checked_agents(agents).in_world(env, params)
     pmdp = several.pmdp
-    spec = {
-        "env": record.name_of(pmdp.env),
-        "key": record.key_data(key),
-        "params": record.digest_of(pmdp.params),
-        "agents": record.digest_of((several.weights, pmdp.threats)),
-        "network": several.config.network,
-        "lookahead": pmdp.lookahead,
-        "shielded": pmdp.shielded,
-        "members": [member._asdict() for member in several.members],
-        "episodes": episodes,
-    }
     players = Players(several.members, several.methods, greedily(several.network), several.weights)
     stage = f"evaluation {name}".strip()
-    where = None if folder is None else Path(folder)
-    job = {**spec, **record.machine(pmdp.env)} if where is not None else {}
+    where = None if folder is None else path("folder", folder)
+    job = {} if where is None else {**spec_of(key, several), "episodes": episodes}
     with record.job(where, stage, job) as checkpoints:
         rows = play_all(key, pmdp, players, episodes, stage, devices, on_progress, checkpoints)
     about = {"env": record.short_name(pmdp.env), "variant": name}
     return Table(scored(rows, pmdp, players, penalty, about))
+
+
+def spec_of(key: Array, agents: Agents) -> dict[str, Any]:
+    """Returns what the episodes of agents depend on, but for their number.
+
+    Args:
+        key: of the episodes.
+        agents: in the world that they are played in.
+    """
+    pmdp = agents.pmdp
+    return {
+        "env": record.name_of(pmdp.env),
+        "key": record.key_data(key),
+        "params": record.digest_of(pmdp.params),
+        "agents": record.digest_of((agents.weights, pmdp.threats)),
+        "members": [member._asdict() for member in agents.members],
+        "network": agents.config.network,
+        "lookahead": pmdp.lookahead,
+        "shielded": pmdp.shielded,
+        **record.machine(pmdp.env),
+    }
 
 
 def checked_agents(agents: Any) -> Agents:

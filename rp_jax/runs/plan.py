@@ -29,7 +29,7 @@ from rp_jax.shield import rounded_down
 from rp_jax.streams import Stream, key_of, numbered
 from rp_jax.threat import artefact
 from rp_jax.threat.function import ThreatFunction
-from rp_jax.validate import number, one_of, random_key, shown
+from rp_jax.validate import number, one_of, path, random_key, shown
 
 Several = float | Sequence[float]
 
@@ -124,7 +124,7 @@ def plan(
         "params": record.digest_of(params),
         "threat": None if threat is None else record.digest_of(threat.models),
     }
-    where = None if folder is None else Path(folder)
+    where = None if folder is None else path("folder", folder)
     if where is not None and threat is not None:
         _same_threat(where, threat)
     if where is not None and (where / saved.AGENTS / "manifest.json").exists():

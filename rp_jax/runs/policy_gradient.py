@@ -33,7 +33,7 @@ from rp_jax.runs.plan import make_pmdp, members_of
 from rp_jax.runs.progress import OnMetrics, OnProgress, silent
 from rp_jax.runs.tables import Table
 from rp_jax.streams import Stream, key_of, numbered
-from rp_jax.validate import finite, none_bad, number, one_of, random_key, shown
+from rp_jax.validate import finite, none_bad, number, one_of, path, random_key, shown
 
 LEARNERS: Mapping[str, Any] = {"CPO": cpo, "PID-Lagrangian": pid_lagrangian}
 CONFIGS: Mapping[str, Any] = {"CPO": CPOConfig, "PID-Lagrangian": PIDConfig}
@@ -142,7 +142,7 @@ def learn_policies(
         "penalty": penalty,
         "params": record.digest_of(params),
     }
-    where = None if folder is None else Path(folder)
+    where = None if folder is None else path("folder", folder)
     keys = numbered(key_of(key, Stream.POLICY_GRADIENT), [member.seed for member in members])
     policies = Policies(method, c, pmdp, None, members, config)
     if where is not None and (where / saved.AGENTS / "manifest.json").exists():
@@ -329,7 +329,7 @@ def evaluate_policies(
     number("penalty", penalty, least=0)
     pmdp = policies.pmdp if params is None else policies.pmdp.replace(params=params)
     stage = f"evaluation {name}".strip()
-    where = None if folder is None else Path(folder)
+    where = None if folder is None else path("folder", folder)
     spec = {
         "env": record.name_of(pmdp.env),
         "key": record.key_data(key),

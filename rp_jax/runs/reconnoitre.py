@@ -26,7 +26,7 @@ from rp_jax.threat import artefact, build, report
 from rp_jax.threat.build import ThreatConfig
 from rp_jax.threat.function import ThreatFunction, load_threat
 from rp_jax.threat.total import total_threat
-from rp_jax.validate import number, one_of, random_key, shown
+from rp_jax.validate import number, one_of, path, random_key, shown
 
 VISITED = 256  # states of the world that sums of threats are judged on
 
@@ -80,7 +80,7 @@ def reconnoitre(
         "settings": settings,
         "params": record.digest_of((subs, params)),
     }
-    where = None if folder is None else Path(folder)
+    where = None if folder is None else path("folder", folder)
     if where is not None and (where / "manifest.json").exists():
         return _finished(where, subs, record.plain(spec))
     with record.job(where, "threat", {**spec, **record.machine(env)}) as checkpoints:

@@ -22,6 +22,7 @@ import numpy as np
 import rp_jax
 from rp_jax import storage
 from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
+from rp_jax.envs.contract import FUNCTIONS
 
 CHECKPOINTS = "checkpoints"  # folder inside that of a job, until it is finished
 LOCK = "lock"  # held by the process that is at work on a job
@@ -75,19 +76,16 @@ def short_name(env: Any) -> str:
 
 
 def code_of(env: Any) -> dict[str, str]:
-    """Returns checksums of the source that computes a job: of the library, and of other files.
+    """Returns checksums of the source that computes a job: of the library, and of other modules.
 
     Args:
         env: the environment, or the module of a script.
 
     Returns:
-        By name of the file; "rp_jax" stands for the library.
+        By name of the module; "rp_jax" stands for the library.
     """
-    found, files = {"rp_jax": library_code()}, sources_of(env)
-    if files:
-        above = Path(os.path.commonpath([file.parent for file in files])).parent
-        found |= {str(file.relative_to(above)): _sha256([file]) for file in files}
-    return found
+    others = {name: _sha256([file]) for name, file in sorted(sources_of(env).items())}
+    return {"rp_jax": library_code(), **others}
 
 
 @functools.cache
@@ -109,45 +107,90 @@ def _sha256(files: Iterable[Path]) -> str:
     return digest.hexdigest()[:16]
 
 
-def sources_of(env: Any) -> list[Path]:
-    """Returns the files of an environment's module, and of what it imports from its own package.
+def sources_of(env: Any) -> dict[str, Path]:
+    """Returns the files of an environment's modules, and of what these import from their package.
 
-    For a module without a package, these are the modules beside it. Files of the library itself do
-    not count, nor do those of other packages.
+    For a module without a package, these are the modules and packages beside it. Files of the
+    library itself do not count, nor do those of other packages.
 
     Args:
-        env: a module, or an object.
+        env: a module, a class, or an object; a wrapper with a field `env` counts together with what
+            it wraps.
+
+    Returns:
+        By name of the module.
+
+    Raises:
+        ValueError: a file cannot be parsed.
     """
-    module = env if isinstance(env, ModuleType) else sys.modules.get(type(env).__module__)
-    left, found = [module], set()
-    library = Path(rp_jax.__file__).parent
+    left, found, library = _modules_of(env), {}, Path(rp_jax.__file__).parent
     while left:
-        module = left.pop()
-        file = Path(getattr(module, "__file__", None) or "")
-        if module is None or file.suffix != ".py" or file in found or not file.is_file():
-            continue
-        if not file.is_relative_to(library):
-            found.add(file)
-            left += [sys.modules.get(name) for name in _own_imports(module, file)]
-    if isinstance(env, ModuleType) or not hasattr(env, "env"):
-        return sorted(found)
-    return sorted(found.union(sources_of(env.env)))  # a wrapper, and what it wraps
+        name, file = left.popitem()
+        if name not in found and not file.is_relative_to(library):
+            found[name] = file
+            left |= _own_imports(name, file)
+    return found
 
 
-def _own_imports(module: ModuleType, file: Path) -> set[str]:
-    """Returns names that a module may import from its own package, or from beside it."""
-    package = module.__package__ or ""
-    top, names = package.partition(".")[0], set()
-    for node in ast.walk(ast.parse(file.read_bytes())):
+def _modules_of(env: Any) -> dict[str, Path]:
+    """Returns the files of the modules in which an environment and its functions are defined."""
+    names: set[Any] = set()
+    seen: list[Any] = []
+    while env is not None and not any(env is one for one in seen):
+        seen.append(env)
+        parts = [getattr(env, function, None) for function in FUNCTIONS]
+        names |= {getattr(part, "__module__", None) for part in parts}
+        names |= {name_of_module(env)}
+        env = None if isinstance(env, ModuleType) else getattr(env, "env", None)
+    modules = [sys.modules[n] for n in names if n in sys.modules]
+    files = {m.__name__: Path(getattr(m, "__file__", None) or "") for m in modules}
+    own = {name: file for name, file in files.items() if file.suffix == ".py"}
+    foreign = sys.stdlib_module_names
+    return {name: file for name, file in own.items() if name.partition(".")[0] not in foreign}
+
+
+def name_of_module(env: Any) -> str:
+    """Returns the name of the module that an environment is, or is defined in.
+
+    Args:
+        env: a module, a class, or an object.
+    """
+    if isinstance(env, ModuleType):
+        return env.__name__
+    return env.__module__ if isinstance(env, type) else type(env).__module__
+
+
+def _own_imports(name: str, file: Path) -> dict[str, Path]:
+    """Returns the modules that a file imports from its own package, or from beside it."""
+    module = sys.modules.get(name)
+    spec = getattr(module, "__spec__", None)
+    whole = spec.name if spec is not None else name  # of a script that runs as __main__, too
+    package = whole if file.name == "__init__.py" else whole.rpartition(".")[0]
+    depth = len(package.split(".")) if package else 0
+    root = file.parents[depth]  # the folder that the package, or the module, is in
+    try:
+        tree = ast.parse(file.read_bytes())
+    except SyntaxError as error:
+        raise ValueError(f"{file} cannot be parsed ({error})") from error
+    names = set()
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             base = "." * node.level + (node.module or "")
             base = importlib.util.resolve_name(base, package) if node.level else base
             names |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
-    if top:
-        return {name for name in names if name.partition(".")[0] == top}
-    return {name for name in names if (file.parent / f"{name.partition('.')[0]}.py").is_file()}
+    if package:
+        names = {name for name in names if name.partition(".")[0] == package.partition(".")[0]}
+    parts = [name.split(".") for name in names]
+    wanted = {".".join(part[:k]) for part in parts for k in range(1, len(part) + 1)}
+    found = {}
+    for other in wanted:
+        place = root.joinpath(*other.split("."))
+        for candidate in (place.with_suffix(".py"), place / "__init__.py"):
+            if candidate.is_file():
+                found[other] = candidate
+    return found
 
 
 def digest_of(tree: Any) -> str:

@@ -14,8 +14,7 @@ import numpy as np
 import rp_jax
 from rp_jax import storage
 from rp_jax.envs import optional
-from rp_jax.envs.check.structure import FUNCTIONS
-from rp_jax.envs.contract import Env
+from rp_jax.envs.contract import FUNCTIONS, Env
 from rp_jax.planning import loop
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.planning.networks import POOLS
@@ -26,7 +25,7 @@ from rp_jax.runs.agents import Agent, Agents, Member
 from rp_jax.runs.dataclass_json import restored
 from rp_jax.threat import artefact
 from rp_jax.threat.function import ThreatFunction, load_threat
-from rp_jax.validate import number, shown
+from rp_jax.validate import number, path, shown
 
 AGENTS, THREAT = "agent", "threat"  # folders inside that of a run
 METRICS = "metrics.jsonl"  # curves of a run
@@ -41,7 +40,8 @@ def save(
     """Saves agents, with their curves and their threat function, or a threat function alone.
 
     Args:
-        folder: created if missing; what was saved there before is replaced.
+        folder: created if missing; what was saved there before is replaced, and lost if this is
+            stopped half-way.
         thing: what `plan` or `reconnoitre` returned.
         settings: keywords of the environment's `make_params` that made the parameters, so that
             agents can be loaded without these; `make_params()` is tried where none are given.
@@ -50,7 +50,9 @@ def save(
         ValueError: it is neither.
         storage.StorageError: it cannot be written.
     """
-    folder = _path(folder)
+    folder = path("folder", folder)
+    if not isinstance(settings, Mapping | None):
+        raise ValueError(f"settings is {shown(settings)}; it must be keywords of make_params")
     if isinstance(thing, Agent):
         raise ValueError("thing is one Agent; it must be Agents: save agents[0:1]")
     if isinstance(thing, ThreatFunction):
@@ -59,13 +61,6 @@ def save(
         save_agents(folder, thing, {"settings": dict(settings or {})})
     else:
         raise ValueError(f"thing is {shown(thing)}; it must be Agents or a ThreatFunction")
-
-
-def _path(folder: Any) -> Path:
-    """Returns the path of a folder."""
-    if not isinstance(folder, str | Path):
-        raise ValueError(f"folder is {shown(folder)}; it must be a path")
-    return Path(folder)
 
 
 def load(folder: str | Path, env: Env | None = None, params: Any = None) -> Any:
@@ -83,10 +78,10 @@ def load(folder: str | Path, env: Env | None = None, params: Any = None) -> Any:
         storage.StorageError: something is missing, damaged, or of another world; or the world or
             its parameters cannot be found by themselves and must be given.
     """
-    folder = _path(folder)
+    folder = path("folder", folder)
     if not folder.is_dir():
         raise storage.StorageError(f"folder is {folder}; there is no such folder")
-    alone = not (folder / AGENTS).is_dir()  # a threat function, without agents
+    alone = not (folder / AGENTS / "manifest.json").exists()  # a threat function, without agents
     if alone and not (folder / "manifest.json").exists():
         raise storage.StorageError(
             f"folder is {folder}; it must hold agents or a threat function, but has no "
@@ -94,6 +89,8 @@ def load(folder: str | Path, env: Env | None = None, params: Any = None) -> Any:
         )
     about = artefact.about(folder) if alone else about_agents(folder)
     world = _checked_env(_world(about) if env is None else env)
+    if params is not None and not hasattr(params, "body"):
+        raise ValueError(f"params is {shown(params)}; it must be parameters of the environment")
     if alone:
         found = params if params is not None else _made(world, {}, folder)
         return load_threat(folder, world.sub_rmdps(found))
@@ -141,7 +138,7 @@ def imported(name: Any) -> Any:
     """
     try:
         return importlib.import_module(str(name))
-    except ImportError as error:
+    except (ImportError, TypeError, ValueError) as error:  # the latter two of names like ".world"
         raise storage.StorageError(
             f"env is {name!r}, which cannot be imported ({error}); it must be a module, such as "
             "rp_jax.envs.jam"
@@ -289,14 +286,14 @@ def restored_agents(
     )
 
 
-def _history(path: Path) -> list[dict[str, Any]]:
+def _history(file: Path) -> list[dict[str, Any]]:
     """Returns the rows of metrics.jsonl, if it is there; nan is null in it."""
     nan = float("nan")
     try:
-        rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+        rows = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
         return [{k: nan if v is None else v for k, v in row.items()} for row in rows]
     except (OSError, ValueError, AttributeError, RecursionError) as error:
-        raise storage.StorageError(f"{path}: cannot be read ({error})") from error
+        raise storage.StorageError(f"{file}: cannot be read ({error})") from error
 
 
 def _seen(env: Env, params: Any, pool: int) -> Encoded:
@@ -369,11 +366,11 @@ def _parameters(folder: Path, env: Any, about: Mapping[str, Any]) -> Any:
     return _with_statics(made, facts.get("statics") or {})
 
 
-def _with_statics(part: Any, statics: Mapping[str, Any], path: str = "") -> Any:
+def _with_statics(part: Any, statics: Mapping[str, Any], above: str = "") -> Any:
     """A tree of dataclasses with some static fields replaced."""
     changes = {}
     for field in dataclasses.fields(part) if dataclasses.is_dataclass(part) else ():
-        name = path + field.name
+        name = above + field.name
         if not field.metadata.get("pytree_node", True):
             if name in statics:
                 changes[field.name] = statics[name]

@@ -19,7 +19,7 @@ from rp_jax.runs.evaluate import Timing, timed
 from rp_jax.runs.progress import OnProgress, silent
 from rp_jax.runs.tables import Table
 from rp_jax.streams import Stream, key_of
-from rp_jax.validate import number, random_key
+from rp_jax.validate import number, path, random_key
 
 GROUP = 50  # episodes between two reports of progress
 
@@ -66,7 +66,7 @@ def evaluate_search(
         "episodes": episodes,
         **record.machine(first.model),
     }
-    where, rows = None if folder is None else Path(folder), []
+    where, rows = None if folder is None else path("folder", folder), []
     with record.job(where, "MPC", spec) as checkpoints:
         for test, search in searches.items():
             own = key_of(key, Stream.SEARCH)

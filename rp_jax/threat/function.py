@@ -37,13 +37,10 @@ class ThreatFunction:
         artefact.save(Path(folder), name, self.models, self.subs, self.about)
 
     def __repr__(self) -> str:
-        sums = self.about.get("sums", {})
-        parts = [
-            f"{kind} (mean absolute error of sums {sums[kind]['mae']:.2g})"
-            if kind in sums
-            else kind
-            for kind in self.models
-        ]
+        sums, parts = self.about.get("sums", {}), []
+        for kind in self.models:
+            mae = sums.get(kind, {}).get("mae")
+            parts.append(kind if mae is None else f"{kind} (mean absolute error of sums {mae:.2g})")
         return f"ThreatFunction({', '.join(parts)})"
 
     @property

@@ -1,5 +1,6 @@
 import functools
 import itertools
+import types
 
 import jax
 import jax.numpy as jnp
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from quick import compile_soon  # noqa: F401
 
+from examples.crossing import world as crossing
 from rp_jax import evaluation
 from rp_jax.baselines import mpc
 from rp_jax.dynamics import angle_of, make_vehicle
@@ -326,3 +328,13 @@ def test_alone_nothing_is_random(env):
 def test_settings_out_of_range_are_named(settings, message):
     with pytest.raises(ValueError, match=message):
         mpc.make_search(jam, params_of("jam"), *settings)
+
+
+def test_what_a_world_of_ones_own_lacks_for_a_search_is_named():
+    params = crossing.make_params()
+    says = r"model is .*; it must have without_moving_hazards\(state\)"
+    with pytest.raises(ValueError, match=says):
+        mpc.make_search(crossing, params, 2, 50.0)
+    alone = types.SimpleNamespace(**vars(crossing), without_moving_hazards=lambda state: state)
+    with pytest.raises(ValueError, match="source of 'pedestrian' has no `behaviour`"):
+        mpc.make_search(alone, params, 2, 50.0)

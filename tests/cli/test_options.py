@@ -54,13 +54,11 @@ def test_settings_of_a_run_without_tests_stay_where_others_are_set(finished, tmp
     own = {**facts["world"]["settings"], "time_limit": 33}
     facts["world"] |= {"settings": own, "tests": {"": own}}
     (tmp_path / "config.json").write_text(json.dumps(facts))
-    for given, limit in (((), 33), (("radius=0.12",), 33), (("time_limit=5",), 5)):
-        if given == ("radius=0.12",):  # the threats hold for .1
-            with pytest.raises(ValueError, match=r"source/radius is 0\.1"):
-                chosen(Choice(run=tmp_path, set=given))
-            continue
+    with pytest.raises(ValueError, match=r"source/radius is 0\.1"):  # the threats hold for .1
+        chosen(Choice(run=tmp_path, set=("radius=0.12",)))
+    for given, limit in ((("fidelity=paper",), 33), (("time_limit=5",), 5)):
         found = chosen(Choice(run=tmp_path, set=given)).agents.pmdp.params
-        assert int(found.time_limit) == limit or not given  # as saved, without a change
+        assert int(found.time_limit) == limit
     found = chosen(Choice(run=tmp_path, set=("hide_position=0.5",))).agents.pmdp.params
     assert (int(found.time_limit), float(found.hide_position)) == (33, 0.5)
 

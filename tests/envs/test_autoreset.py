@@ -29,6 +29,35 @@ class Toy:
         return {"last": state["last"], "time": time}, outcome
 
 
+class Keys:
+    """Its states hold the words of the keys that they were made with; ends are by a table."""
+
+    @staticmethod
+    def reset(key, params):
+        return {"made_by": jax.random.key_data(key), "row": jnp.asarray(-1)}
+
+    @staticmethod
+    def step(key, state, action, params):
+        terminated, truncated = params[state["row"]]
+        none = jnp.zeros(())
+        outcome = contract.Outcome(none, none, terminated, truncated, jnp.asarray(False))
+        return {"made_by": jax.random.key_data(key), "row": state["row"]}, outcome
+
+
+def test_either_end_restarts_an_episode_with_a_key_that_no_step_has():
+    ends = jnp.asarray([[False, False], [True, False], [False, True]])
+    keys = jax.random.split(jax.random.key(0), 3)
+    states = {"made_by": jnp.zeros((3, 2), jnp.uint32), "row": jnp.arange(3)}
+    carried, reached, outcome = jax.jit(autoreset.auto_reset_step, static_argnums=0)(
+        Keys, keys, states, jnp.zeros(3, int), ends
+    )
+    np.testing.assert_array_equal(outcome.done, [False, True, True])
+    np.testing.assert_array_equal(reached["row"], [0, 1, 2])
+    np.testing.assert_array_equal(carried["row"], [0, -1, -1])
+    words = np.concatenate([carried["made_by"], reached["made_by"]])
+    assert len(np.unique(words, axis=0)) == 3 + 2  # the row that goes on is in both
+
+
 def test_what_is_seen_belongs_to_the_states_and_starts_are_looked_at_only_where_needed():
     keys = jax.random.split(jax.random.key(0), 40)
     last = jnp.arange(40, dtype=jnp.int32) % 4 + 1

@@ -86,8 +86,8 @@ MUTANTS = [
         "tests/planning/test_loop.py tests/planning/test_q_probes.py",
         (
             "exploration outside the set",
-            "masked_sample(pick, admissible)",
-            "masked_sample(pick, admissible | True)",
+            "masked_choice(pick, admissible)",
+            "masked_choice(pick, admissible | True)",
         ),
         (
             "the mask of s for s'",
@@ -115,8 +115,8 @@ MUTANTS = [
         ),
         (
             "life after a crash in the backup",
-            "flat(outcome.danger) + jnp.where(going, after, 0.0)",
-            "flat(outcome.danger) + after",
+            "going = flat(~outcome.terminated)",
+            "going = flat(~outcome.terminated) | True",
         ),
         (
             "the backup forgets the step's danger",

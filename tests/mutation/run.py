@@ -38,6 +38,7 @@ def caught(mutant: Mutant, checkout: Path, cache: Path) -> tuple[bool, str]:
     """Returns whether a test fails under the bug, and the last line that pytest prints."""
     file = checkout / mutant.file
     sound = file.read_text()
+    assert sound.count(mutant.old) == 1, f"{mutant.file}: {mutant.name} cannot be planted"
     file.write_text(sound.replace(mutant.old, mutant.new))
     try:
         done = subprocess.run(

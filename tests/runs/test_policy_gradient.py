@@ -112,3 +112,14 @@ def test_bad_settings_are_named(changes, message, tmp_path):
     with pytest.raises(ValueError, match=f"^{message}"):
         learn(settings.pop("method"), tmp_path / "new", **{"config": CONFIGS["CPO"], **settings})
     assert not (tmp_path / "new").exists()
+
+
+def test_a_world_that_takes_no_continuous_actions_is_named(monkeypatch):
+    def step(key, state, action, params):
+        return probe_step(key, state, jax.numpy.zeros((3,))[action].astype(int), params)
+
+    probe_step = probe.step
+    monkeypatch.setattr(probe, "step", step)
+    says = r"config\.rollout\.policy is 'gaussian'; it must be 'categorical' in probe, whose step"
+    with pytest.raises(ValueError, match=says):
+        learn("CPO", config=CPOConfig(dataclasses.replace(ROLLOUT, policy="gaussian")))

@@ -1,11 +1,12 @@
 """Whether the environment moves the body as the body's model does."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
 
-from rp_jax.dynamics import delayed
+from rp_jax.dynamics import ControlDistribution, delayed
 from rp_jax.envs.check.batches import Batched, flat, join, take, typed
 from rp_jax.envs.check.comparison import RARE, unequal
 from rp_jax.envs.check.problems import number_of, same_structure, value_of
@@ -49,14 +50,20 @@ def _of_other_models(trial: Trial, steps: Any) -> list[str]:
         model = trial.env.sub_rmdps(trial.params)[kind].body
         if model is trial.model or _alike(model, trial.model):
             continue
-
-        def step(params: Any, body: Any, action: Any, kind: str = kind) -> Any:
-            model = trial.env.sub_rmdps(params)[kind].body
-            return model.step(body, model.control(action))
-
-        moved = Batched(step)(trial.params, steps.before.body, steps.action)
+        moved = _of_sub_rmdp(trial, kind)(steps.before.body, steps.action)
         found += _unlike(trial, steps, moved, f"sub_rmdps(params)[{kind!r}].body")
     return found
+
+
+def _of_sub_rmdp(trial: Trial, kind: str) -> Callable[[Any, np.ndarray], Any]:
+    """Returns the step of the body of a kind's sub-R-MDP, for bodies and actions (n, ...)."""
+
+    def step(params: Any, body: Any, action: Any) -> Any:
+        model = trial.env.sub_rmdps(params)[kind].body
+        return model.step(body, model.control(action))
+
+    batched = Batched(step)
+    return lambda bodies, actions: batched(trial.params, bodies, actions)
 
 
 def _alike(one: Any, other: Any) -> bool:
@@ -69,25 +76,30 @@ def _alike(one: Any, other: Any) -> bool:
 def hasty_controls(trial: Trial) -> list[str]:
     """Returns for which kinds a control decides at once what is hit, though it is delayed.
 
+    It matters where threats are enumerated, which leaves the last control out.
+
     Args:
         trial: the environment.
     """
-    if not delayed(trial.model):
-        return []
     found = []
     for kind, pairs in trial.pairs.items():
+        model = trial.env.sub_rmdps(trial.params)[kind].body
+        listed = isinstance(model.baseline, ControlDistribution)
+        if not (pairs.static and listed and delayed(model)):
+            continue
         body, hazard = pairs.sample(HASTY)
+        step = _of_sub_rmdp(trial, kind)
         one, other = (
-            pairs.look(trial.away(body, trial.draws.integers(HASTY, trial.num_actions)), hazard)[1]
+            pairs.look(step(body, trial.draws.integers(HASTY, trial.num_actions)), hazard)[1]
             for _ in range(2)
         )
         unlike = int((one != other).sum())
         if unlike > RARE * HASTY:
             found.append(
-                "params.body.delayed is True, but a control decides at once whether a hazard is "
-                f"hit: after one step under two actions, `hits` of the source of {kind!r} differs "
-                f"in {number_of(unlike, HASTY, 'pairs')}; `delayed` must be False, or the last "
-                "control is left out of the threats"
+                f"sub_rmdps(params)[{kind!r}].body.delayed is True, but a control decides at once "
+                "whether a hazard is hit: after one step under two actions, `hits` differs in "
+                f" {number_of(unlike, HASTY, 'pairs')}; `delayed` must be False, as the last "
+                "control is left out of the enumerated threats of a body that is delayed"
             )
     return found
 

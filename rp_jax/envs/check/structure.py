@@ -13,15 +13,9 @@ from rp_jax.envs.check.body_structure import action_problems, body_problems, mir
 from rp_jax.envs.check.hazard_structure import hazard_problems
 from rp_jax.envs.check.problems import described, differences, plain, trouble
 from rp_jax.envs.check.shapes import scalar, shape_of
+from rp_jax.envs.contract import FUNCTIONS
 from rp_jax.validate import shown
 
-FUNCTIONS = {
-    "reset": "(key, params)",
-    "step": "(key, state, action, params)",
-    "observe": "(state, params)",
-    "hazards": "(state, params)",
-    "sub_rmdps": "(params)",
-}
 OPTIONAL = (
     "num_actions",
     "collisions",
@@ -145,14 +139,16 @@ def _observation_problems(env: Any, params: Any, state: Any) -> list[str]:
         return found
     if hasattr(env, "threshold"):
         x, problems = shape_of("threshold", env.threshold, state)
-        found += problems if x is None else scalar("threshold(state)", x, "floating")
+        found += problems or scalar("threshold(state)", x, "floating")
     flat = getattr(seen, "ndim", None) == 1 and seen.shape[0] >= 1
     if not flat or not jnp.issubdtype(seen.dtype, jnp.floating):
         text = described(seen) if hasattr(seen, "dtype") else type(seen).__name__
         return [f"observe returns {text}; it must return a flat array of floats"]
-    size, bins, scale = seen.shape[0], optional.lidar_bins(env), optional.scale(env)
-    if not isinstance(scale, list | tuple | np.ndarray) or np.ndim(scale) != 1:
-        return [f"SCALE is {shown(scale)}; it must be a tuple of numbers, or be left out"]
+    size, bins = seen.shape[0], optional.lidar_bins(env)
+    try:
+        scale = optional.scale(env)
+    except (TypeError, ValueError):
+        return [*found, f"SCALE is {shown(env.SCALE)}; it must be a tuple of numbers, or left out"]
     whole = isinstance(bins, int | np.integer) and not isinstance(bins, bool)
     if not whole or bins < 0 or bins % 8 or bins > size:
         return [
