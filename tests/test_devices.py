@@ -44,6 +44,7 @@ def test_four_devices_do_what_one_does():
     same_as_one_device(found)
 
 
+@pytest.mark.slow
 def test_two_processes_do_what_one_does():
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))

@@ -28,6 +28,13 @@ from rp_jax.threat.fit import Dataset, FitConfig
 PARAMS = probe.make_params()
 CONFIG = LoopConfig(steps=64, num_envs=8, batch=8, n_step=1, replay=64, replay_start=8)
 WRONG = [np.nan, np.inf, -np.inf]
+each_wrong = pytest.mark.parametrize(  # nan, which compares with nothing, is the one to miss
+    "wrong", [np.nan, *(pytest.param(wrong, marks=pytest.mark.slow) for wrong in WRONG[1:])]
+)
+each_learner = pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.slow] * (n != "CPO")) for n in policy_gradient.LEARNERS],
+)
 
 
 @pytest.fixture(autouse=True)
@@ -89,7 +96,14 @@ def test_what_is_sound_passes():
     played(pmdp)
 
 
-@pytest.mark.parametrize(("wrong", "place"), [(np.nan, 7), (np.inf, 0), (-np.inf, 17)])
+@pytest.mark.parametrize(
+    ("wrong", "place"),
+    [
+        (np.inf, 0),
+        pytest.param(np.nan, 7, marks=pytest.mark.slow),
+        pytest.param(-np.inf, 17, marks=pytest.mark.slow),
+    ],
+)
 def test_observations_are_named(wrong, place):
     pmdp = probe.make_pmdp(seen_with(wrong, place), PARAMS)
     with pytest.raises(FloatingPointError, match=r"^N=8: observations of \d+ steps are nan"):
@@ -114,7 +128,7 @@ class Threatened(PMDP):
         return jnp.where(there, wrong, jnp.zeros((states.time.shape[0], 3)))
 
 
-@pytest.mark.parametrize("wrong", WRONG)
+@each_wrong
 def test_threats_are_named(wrong):
     like = probe.make_pmdp(probe, PARAMS)
     fields = {name: getattr(like, name) for name in like.__dataclass_fields__}
@@ -152,7 +166,7 @@ def test_a_threat_that_is_nan_is_inadmissible_and_a_row_of_nothing_else_is_found
         played(pmdp)
 
 
-@pytest.mark.parametrize("wrong", WRONG[:2])
+@each_wrong
 def test_rewards_are_named(wrong):
     pmdp = probe.make_pmdp(paid_with(wrong), PARAMS)
     with pytest.raises(FloatingPointError, match=r"^planning: rewards of \d+ steps"):
@@ -161,7 +175,7 @@ def test_rewards_are_named(wrong):
         played(pmdp)
 
 
-@pytest.mark.parametrize("wrong", WRONG[:2])
+@each_wrong
 def test_losses_are_named(wrong, monkeypatch):
     huber = optax.huber_loss
     monkeypatch.setattr(optax, "huber_loss", lambda *of: huber(*of).at[0].set(wrong))
@@ -180,7 +194,7 @@ def faulty(wrong, adam=optax.adam(1e-3)):  # noqa: B008
     return optax.GradientTransformation(adam.init, update)
 
 
-@pytest.mark.parametrize("wrong", WRONG[:2])
+@each_wrong
 def test_gradients_are_named(wrong, monkeypatch):
     monkeypatch.setattr(dqn, "optimiser", lambda *_: faulty(wrong))
     one = dataclasses.replace(CONFIG)
@@ -196,14 +210,14 @@ def learns(name, env):
     )
 
 
-@pytest.mark.parametrize("name", policy_gradient.LEARNERS)
+@each_learner
 def test_policy_gradients_stop_at_rewards_that_are_none(name):
     """CPO would go on in silence: its line search accepts no step, and its policy stays finite."""
     with pytest.raises(FloatingPointError, match=rf"^{name}: rewards of \d+ steps are nan"):
         learns(name, paid_with(np.nan))
 
 
-@pytest.mark.parametrize("name", policy_gradient.LEARNERS)
+@each_learner
 def test_policy_gradients_name_observations_and_what_is_learned(name, monkeypatch):
     with pytest.raises(FloatingPointError, match=rf"^{name}: observations of \d+ steps are nan"):
         learns(name, seen_with(np.inf, 17))
@@ -238,7 +252,7 @@ def fitted(monkeypatch, change=None, wrong=0.5):
     return build.fitted(jax.random.key(0), sub, data, config)
 
 
-@pytest.mark.parametrize("wrong", WRONG[:2])
+@each_wrong
 def test_the_losses_and_gradients_of_a_fit_are_named(wrong, monkeypatch):
     fitted(monkeypatch)
     with pytest.raises(FloatingPointError, match=r"^fit: (losses|weights):"):

@@ -14,7 +14,7 @@ from rp_jax.envs import optional
 from rp_jax.envs.contract import Env, Outcome
 from rp_jax.planning.percept import Percept, encode
 from rp_jax.threat.model import ThreatModel
-from rp_jax.threat.static import compress_above_one, plan_clearance, static_threat
+from rp_jax.threat.static import compress_above_one, plan_clearances, static_threat
 from rp_jax.threat.total import total_threat
 
 OUTCOMES = 0x100C  # seed for sampled outcomes of actions; no environment's keys come from it
@@ -115,7 +115,7 @@ class PMDP(struct.PyTreeNode):
         if not isinstance(model.baseline, Plans):
             return None
         clearance = lambda position: optional.clearance(self.env, position, self.params)  # noqa: E731
-        return static_threat(jax.vmap(lambda body: plan_clearance(body, model, clearance))(bodies))
+        return static_threat(plan_clearances(bodies, model, clearance))
 
     def _summed(self, states: Any, static: Array | None, alive: Array | None) -> Array:
         """Returns the sum over hazards (B, A) of their threats (Theorem 3).

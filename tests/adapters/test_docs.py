@@ -48,6 +48,7 @@ def test_the_readme_trains_evaluates_loads_and_acts(monkeypatch, tmp_path, capsy
     assert (tmp_path / "jam" / "threat" / "manifest.json").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "count"), [("docs/adapters.md", 6)])
 def test_what_the_docs_show_runs(page, count, monkeypatch):
     monkeypatch.chdir(ROOT)

@@ -200,6 +200,7 @@ def test_recovery_reduces_the_danger():
     assert danger[-5:].mean() < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 3])
 def test_on_a_finite_cmdp_it_keeps_the_limit_and_comes_near_the_optimum(seed):
     model = cases.random_cmdp(seed, gamma=1.0, beta=1.0)
@@ -216,6 +217,7 @@ def test_on_a_finite_cmdp_it_keeps_the_limit_and_comes_near_the_optimum(seed):
     assert value > best.value - 0.1
 
 
+@pytest.mark.slow
 def test_limits_and_seeds_side_by_side_learn_what_each_learns_alone(compile_soon):
     model = cases.random_cmdp(3, gamma=1.0, beta=1.0)
     pmdp = finite.pmdp_of(model)

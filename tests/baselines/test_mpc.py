@@ -191,7 +191,12 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+SLOW = ("circuit, 4", "jam, 3", "jam, 2, as in the text")
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[pytest.mark.slow] * (case in SLOW)) for case in CASES]
+)
 def test_pruning_changes_no_choice(case):
     env, horizon, settings, limit = CASES[case]
     states = driven(env, 16, 11, **settings)
@@ -219,6 +224,7 @@ def test_safe_sequences_come_before_all_others():
     assert float(search_of("jam", 2).score(node_of(40, 2.0))) == -60
 
 
+@pytest.mark.slow
 def test_a_row_does_not_depend_on_its_batch():
     settings = {"num_obstacles": 3}
     search, states = search_of("jam", 2, **settings), driven("jam", 12, 11, **settings)

@@ -136,6 +136,7 @@ def test_a_batch_without_an_end_keeps_the_last_measure(compile_soon):
     assert metrics.penalty == state.controller.integral == 0
 
 
+@pytest.mark.slow
 def test_on_a_finite_cmdp_it_keeps_the_limit_and_comes_near_the_optimum():
     model = cases.random_cmdp(0, gamma=1.0, beta=1.0)
     least = float(exact.expected(model, exact.least_threat(model)))
@@ -151,6 +152,7 @@ def test_on_a_finite_cmdp_it_keeps_the_limit_and_comes_near_the_optimum():
     assert metrics.penalty[-1] > 0.1
 
 
+@pytest.mark.slow
 def test_limits_and_seeds_side_by_side_learn_what_each_learns_alone(compile_soon):
     model = cases.random_cmdp(3, gamma=1.0, beta=1.0)
     pmdp = finite.pmdp_of(model)

@@ -44,12 +44,14 @@ def solved(name, model, limit):
     return danger_and_return(model, pmdp, learned(name, pmdp, limit, ROLLOUT, 60))
 
 
+@pytest.mark.slow
 @every_learner
 def test_what_an_action_earns_is_seen(name):
     _, value = solved(name, finite.bandit([0.0, 1.0, 0.5]), 1.0)
     assert value > 0.95
 
 
+@pytest.mark.slow
 @every_learner
 def test_credit_reaches_back_over_time(name):
     _, value = solved(name, finite.delayed(steps=4), 1.0)
@@ -63,6 +65,7 @@ def test_a_tempting_danger_is_taken_as_often_as_is_allowed(name):
     assert value == pytest.approx(1 + danger, abs=1e-4)
 
 
+@pytest.mark.slow
 @every_learner
 @pytest.mark.parametrize("limit", [0.02, 1.0])
 def test_continuous_actions_reach_the_coin_or_the_bait(name, limit):

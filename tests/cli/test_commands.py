@@ -128,6 +128,7 @@ def test_a_rate_is_shown_or_not_shown_with_the_planned_episodes(finished, tmp_pa
     assert row["episodes"] == row["planned_episodes"]
     assert row["upper_bound"] <= 0.2
     assert "SHOWN: circuit circle time_limit=1" in " ".join(capsys.readouterr().out.split())
+    out.unlink()
     with pytest.raises(SystemExit, match="1"):
         call(*common, "--c", "0.2", "--expected", "0")  # it has hardly learned
     row = json.loads(out.read_text())
@@ -157,6 +158,7 @@ def test_what_cannot_be_certified_is_named(words, message, finished, capsys):
 SIZES = RareConfig(particles=20, repeats=3, generations=2, population=20, tries=4, kept=3, checks=8)
 
 
+@pytest.mark.slow
 def test_rare_events_and_worst_starts_of_a_run(drawn, tmp_path):
     found, out = chosen(Choice(run=drawn)), storage.new_folder(tmp_path / "rare")
     config = rare_command.RareOptions(run=drawn, out=out, sizes=SIZES)

@@ -309,6 +309,7 @@ def test_trajectories_of_three_methods(circuit_runs, tmp_path, monkeypatch):
     assert set(fig6.tell(results).figures) == {p.name for p in folder.iterdir()} - {"results.json"}
 
 
+@pytest.mark.slow
 def test_all_methods_are_timed_in_one_process(circuit_runs, tmp_path, monkeypatch):
     monkeypatch.setattr(timing, "SEARCHES", {"circuit": (1, 4)})
     monkeypatch.setitem(timing.LEARNED_ON, "circuit", "circle")

@@ -187,6 +187,7 @@ def test_seeds_side_by_side_learn_what_each_learns_alone(compile_soon):
         np.testing.assert_allclose(mine.loss, metrics.loss, rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_penalties_and_seeds_learn_as_one_program_what_each_learns_alone(compile_soon):
     """Penalised DQN: every Lagrange coefficient and seed at once."""
     config = dataclasses.replace(CONFIG, num_envs=8, batch=16, replay=160, replay_start=40)

@@ -31,6 +31,7 @@ def test_those_that_act_at_random_have_episodes_of_their_own_for_each_seed(world
     assert played(0) != played(1)
 
 
+@pytest.mark.slow
 def test_all_kinds_of_agents_are_compared_with_the_settings_that_are_given(world):
     agents, table = ablation.compare_shields(
         KEY,

@@ -13,6 +13,7 @@ from cases import S, U, counterexample_1
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from quick import compile_soon  # noqa: F401
 
 from experiments import theorems
 from rp_jax import shield
@@ -41,7 +42,10 @@ def found(horizon):
     return values
 
 
-@pytest.mark.parametrize("horizon", theorems.HORIZONS)
+@pytest.mark.parametrize(
+    "horizon",
+    [pytest.param(n, marks=[pytest.mark.slow] * (n in (1, 4))) for n in theorems.HORIZONS],
+)
 @pytest.mark.parametrize("theorem", [*verify.CHECKS, "theorem 3"])
 def test_no_theorem_is_violated(theorem, horizon):
     if horizon is None and theorem in verify.FINITE:
@@ -146,6 +150,7 @@ def shorter(beta, horizon, right=thresholds.effective_horizon):
     return right(beta, horizon - 1)
 
 
+@pytest.mark.slow
 def test_one_step_too_few_in_the_effective_horizon_is_caught(monkeypatch):
     monkeypatch.setattr(thresholds, "effective_horizon", shorter)
     broken = violated(cmdps, 3)
@@ -159,6 +164,7 @@ def late(cmdp, policy, right=exact.threat):
     return found._replace(action=cmdp.beta * found.action, state=cmdp.beta * found.state)
 
 
+@pytest.mark.slow
 def test_one_power_of_beta_too_many_is_caught(monkeypatch):
     for module in (exact, thresholds):
         monkeypatch.setattr(module, "threat", late)
@@ -167,6 +173,7 @@ def test_one_power_of_beta_too_many_is_caught(monkeypatch):
     assert broken["theorem 2"] > 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["corollary_1", "corollary_2"])
 def test_factors_below_1_are_caught(monkeypatch, which):
     right = getattr(thresholds, which)
@@ -174,6 +181,7 @@ def test_factors_below_1_are_caught(monkeypatch, which):
     assert violated(cmdps, 3, count=2_000)[which.replace("_", " ")] > 5
 
 
+@pytest.mark.slow
 def test_charging_less_than_x_for_a_drift_is_caught(monkeypatch):
     right = verify._drifting
     wrong = lambda action, admissible, eta, x: right(action, admissible, eta, 0.9 * x)  # noqa: E731
@@ -184,6 +192,7 @@ def test_charging_less_than_x_for_a_drift_is_caught(monkeypatch):
     assert broken["theorem 2"] > 10
 
 
+@pytest.mark.slow
 def test_a_certificate_without_the_excess_is_caught(monkeypatch):
     right = thresholds._excess
 

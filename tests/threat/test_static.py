@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 
 from rp_jax import shield
-from rp_jax.dynamics import Vehicle, make_vehicle
+from rp_jax.dynamics import Vehicle, VehicleModel, make_vehicle
 from rp_jax.envs import circuit, jam, tracks
-from rp_jax.threat.static import MARGIN, compress_above_one, plan_clearance, static_threat
+from rp_jax.threat.static import (
+    MARGIN,
+    compress_above_one,
+    plan_clearance,
+    plan_clearances,
+    static_threat,
+)
 
 
 @functools.cache
@@ -48,6 +54,43 @@ def test_clearance_never_exceeds_the_room_and_comes_close(env):
     assert (found[relevant] <= true[relevant] + 1e-6).all()
     assert (found[relevant] >= true[relevant] - 0.011).all()
     assert np.abs(found[relevant] - true[relevant]).mean() < 1e-3
+
+
+class Heavy(VehicleModel):
+    """A vehicle that slides by a tenth of a turn's side, unlike those whose paths are moved."""
+
+    def step(self, vehicle, control):
+        moved = super().step(vehicle, control)
+        return moved.replace(position=moved.position + 0.01 * moved.heading[::-1])
+
+
+@pytest.mark.parametrize("kind", ["vehicle", "kept in a room", "of its own"])
+@pytest.mark.parametrize("env", [circuit, jam])
+def test_many_bodies_at_once_have_the_clearances_of_each_alone(env, kind):
+    params, rng = made(env), np.random.default_rng(1)
+    model, rows = params.body, 40
+    if kind == "kept in a room":
+        model = model.replace(room=jnp.asarray(0.5))
+    if kind == "of its own":
+        model = Heavy(model.actions, model.baseline, model.speeds)
+    speeds = rng.choice(np.asarray(model.speeds), rows).astype(np.float32)
+    speeds[3::4] = rng.uniform(model.speeds[0], model.speeds[-1], rows // 4)  # others, too
+    places = rng.uniform(0.3, 1.0, (rows, 2))
+    bodies = make_vehicle(places, rng.uniform(-np.pi, np.pi, rows), speeds)
+    room = lambda position: env.clearance(position, params)  # noqa: E731
+    found = jax.jit(lambda b: plan_clearances(b, model, room))(bodies)
+    each = jax.jit(jax.vmap(lambda b: plan_clearance(b, model, room)))(bodies)
+    assert found.shape == each.shape == (rows, len(model.baseline.target), 15)
+    np.testing.assert_allclose(found, each, rtol=0, atol=2e-6)
+    np.testing.assert_array_equal(static_threat(found) > 0, static_threat(each) > 0)
+
+
+@pytest.mark.parametrize("env", [circuit, jam])
+def test_a_body_that_is_nowhere_has_no_clearance(env):
+    params = made(env)
+    body = make_vehicle(jnp.full((2, 2), jnp.nan), jnp.zeros(2), jnp.zeros(2))
+    room = lambda position: env.clearance(position, params)  # noqa: E731
+    assert np.isnan(plan_clearances(body, params.body, room)).all()
 
 
 @pytest.mark.parametrize("env", [circuit, jam])
