@@ -422,7 +422,9 @@ def a_control_of_another_shape():
 # --- 1. purity ---
 
 
-@mutant("purity", r"step is not pure: for the same key, state and action, outcome.reward is")
+@mutant(
+    "purity", r"step is not pure: for the same key, state and action, outcome.reward is", slow=True
+)
 def a_step_that_counts_its_calls():
     calls = itertools.count()
     return with_outcome(lambda o, s, p: o.replace(reward=o.reward + 0.01 * next(calls)))
@@ -605,7 +607,11 @@ def a_trolley_that_is_pushed():
 # --- 5. hazards that move ---
 
 
-@mutant("moves of hazards", r"step moves hazards of kind 'pedestrian' otherwise than their source")
+@mutant(
+    "moves of hazards",
+    r"step moves hazards of kind 'pedestrian' otherwise than their source",
+    slow=True,
+)
 def pedestrians_that_hurry():
     def change(state, action, params, reached, outcome):
         way = reached.walkers.position - state.walkers.position
@@ -670,7 +676,9 @@ def swapped_rates_of_the_swing():
     return trolley, params.replace(cart=as_a(Cart, params.cart))
 
 
-@mutant("features", r"features of the source of 'pedestrian' do not say all: in .* pairs")
+@mutant(
+    "features", r"features of the source of 'pedestrian' do not say all: in .* pairs", slow=True
+)
 def features_without_the_way():
     class Pedestrian(crossing.Pedestrian):
         def features(self, body, hazard):
@@ -680,7 +688,9 @@ def features_without_the_way():
 
 
 @mutant(
-    "samples", r"sample of the source of 'pedestrian' draws .* pairs for which in_reach is False"
+    "samples",
+    r"sample of the source of 'pedestrian' draws .* pairs for which in_reach is False",
+    slow=True,
 )
 def samples_out_of_reach():
     class Pedestrian(crossing.Pedestrian):
@@ -692,7 +702,9 @@ def samples_out_of_reach():
 
 
 @mutant(
-    "samples", r"in_reach of the source of 'pedestrian' is False in .* that `hits` says are hit"
+    "samples",
+    r"in_reach of the source of 'pedestrian' is False in .* that `hits` says are hit",
+    slow=True,
 )
 def hits_from_behind_that_are_not_in_reach():
     class Pedestrian(crossing.Pedestrian):
@@ -863,7 +875,9 @@ def controls_that_act_at_once():
     return world, params.replace(body=fast)
 
 
-@mutant("plans", r"plan \d+ still moves after its horizon of 4 steps, by 0\.\d+ in a step")
+@mutant(
+    "plans", r"plan \d+ still moves after its horizon of 4 steps, by 0\.\d+ in a step", slow=True
+)
 def plans_that_are_cut_off():
     params = jam.make_params(baseline="plans")
     plans = params.body.baseline.replace(horizon=4)
@@ -940,7 +954,11 @@ def obstacles_that_are_not_listed():
 # --- 10. static hazards ---
 
 
-@mutant("static hazards", r"step of the source of 'pedestrian' moves the hazard in .* `static` is")
+@mutant(
+    "static hazards",
+    r"step of the source of 'pedestrian' moves the hazard in .* `static` is",
+    slow=True,
+)
 def pedestrians_that_are_said_to_stand():
     class Pedestrian(crossing.Pedestrian):
         static = True

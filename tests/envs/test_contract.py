@@ -34,7 +34,9 @@ LIMIT, STEPS, ROWS = 25, 300, 7
 FUNCTIONS = ["reset", "step", "observe", "hazards", "sub_rmdps"]  # others are optional
 # One of each module, for tests that are long and to which the variant does not matter.
 EACH_MODULE = {env: name for name, (env, _) in reversed(ENVS.items())}
-every_env = pytest.mark.parametrize("name", ENVS)
+every_env = pytest.mark.parametrize(  # a simulated body takes long to compile
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "trolley")) for name in ENVS]
+)
 every_module = pytest.mark.parametrize("name", EACH_MODULE.values())
 
 

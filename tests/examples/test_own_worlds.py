@@ -65,6 +65,7 @@ def bodies():
     return sub, jax.jit(draw)(jax.random.key(0))
 
 
+@pytest.mark.slow
 def test_a_body_takes_the_steps_of_the_pipeline_from_any_state():
     sub, (body, _) = bodies()
     system, controls = physics.load(world.MODEL), jnp.tile(sub.body.actions[:8], (8, 1))
@@ -109,6 +110,7 @@ def test_features_of_a_cart_say_all_and_mirror_with_the_actions():
     np.testing.assert_allclose(there.q * jnp.asarray([[1, -1, -1, 1]]), here.q, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_threats_of_a_body_depend_on_where_it_swings_to():
     sub, _ = bodies()
     swing = jnp.asarray([[0.0] * 4, [0.0] * 4])

@@ -276,6 +276,8 @@ def test_what_is_written_says_what_it_is(agents, threat):
 class Wider:
     """The corridor with an observation that is one number longer."""
 
+    SCALE = ()
+
     def __getattr__(self, name):
         return getattr(probe, name)
 
@@ -288,23 +290,22 @@ class Fewer(Wider):
     """The corridor with two actions."""
 
     observe = staticmethod(probe.observe)
-
-    @staticmethod
-    def num_actions(params):
-        return 2
+    num_actions = staticmethod(lambda params: 2)
 
 
-@pytest.mark.parametrize(
-    ("world", "says"),
-    [
-        (Wider(), r"length of the observation is \d+; it must be \d+, as where the agents learned"),
-        (Fewer(), r"number of actions is 2; it must be 3"),
-    ],
-)
-def test_a_world_in_which_agents_cannot_act_is_refused(world, says, agents):
-    for call in (rp_jax.evaluate, functools.partial(rp_jax.certify, c=0.5)):
-        with pytest.raises(ValueError, match=says):
-            call(KEY, agents, world)
+def test_a_world_in_which_agents_cannot_act_is_refused(agents, params):
+    few = params.replace(
+        body=params.body.replace(actions=jax.tree.map(lambda a: a[:2], params.body.actions))
+    )
+    for world, given, says in (
+        (Wider(), None, r"length of the observation is \d+; it must be \d+, as where the agents"),
+        (Fewer(), few, "number of actions is 2; it must be 3"),
+        (jam, None, "reset cannot be traced"),
+        ("jam", None, "the environment has no function `reset`"),
+    ):
+        for call in (rp_jax.evaluate, functools.partial(rp_jax.certify, c=0.5)):
+            with pytest.raises(ValueError, match=says):
+                call(KEY, agents, world, given)
 
 
 def test_another_horizon_is_another_job(params, tmp_path):

@@ -35,6 +35,7 @@ def made(tmp_path_factory):
     return rows, folder
 
 
+@pytest.mark.slow
 def test_each_kind_of_agent_test_and_threshold_has_a_row_over_all_seeds(made):
     rows, _ = made
     assert [(row["planner"], row["variant"], row["x"]) for row in rows] == [
@@ -48,6 +49,7 @@ def test_each_kind_of_agent_test_and_threshold_has_a_row_over_all_seeds(made):
         assert 0 <= row["insecure"] <= 1
 
 
+@pytest.mark.slow
 def test_all_agents_learn_and_none_acts_inadmissibly(made):
     _, folder = made
     for name, count in (("separate", 4), ("told", 2)):

@@ -64,8 +64,10 @@ class Heavy(VehicleModel):
         return moved.replace(position=moved.position + 0.01 * moved.heading[::-1])
 
 
-@pytest.mark.parametrize("kind", ["vehicle", "kept in a room", "of its own"])
-@pytest.mark.parametrize("env", [circuit, jam])
+@pytest.mark.parametrize(
+    ("env", "kind"),
+    [(jam, "vehicle"), (circuit, "vehicle"), (jam, "kept in a room"), (jam, "of its own")],
+)
 def test_many_bodies_at_once_have_the_clearances_of_each_alone(env, kind):
     params, rng = made(env), np.random.default_rng(1)
     model, rows = params.body, 40
@@ -85,9 +87,8 @@ def test_many_bodies_at_once_have_the_clearances_of_each_alone(env, kind):
     np.testing.assert_array_equal(static_threat(found) > 0, static_threat(each) > 0)
 
 
-@pytest.mark.parametrize("env", [circuit, jam])
-def test_a_body_that_is_nowhere_has_no_clearance(env):
-    params = made(env)
+def test_a_body_that_is_nowhere_has_no_clearance():
+    env, params = jam, made(jam)
     body = make_vehicle(jnp.full((2, 2), jnp.nan), jnp.zeros(2), jnp.zeros(2))
     room = lambda position: env.clearance(position, params)  # noqa: E731
     assert np.isnan(plan_clearances(body, params.body, room)).all()
