@@ -13,7 +13,7 @@ def test_every_recipe_is_in_range(name):
 
 
 def test_there_are_recipes_of_threats_and_a_planner():
-    assert len(CONFIGS) == 7
+    assert len(CONFIGS) == 8
 
 
 def test_threats_that_are_enumerated_have_one_recipe_and_those_that_are_sampled_another():
@@ -23,14 +23,21 @@ def test_threats_that_are_enumerated_have_one_recipe_and_those_that_are_sampled_
         **point_gather.sub_rmdps(point_gather.make_params()),
         **probe.sub_rmdps(probe.make_params()),
     }
-    found = {kind: recipes.tuned(sub) is recipes.TUNED_WALL for kind, sub in kinds.items()}
-    assert found == {
-        "jam wall": True,
-        "jam obstacle": False,
-        "wall": True,
-        "bomb": False,  # it stays, but its rollouts are too many to be enumerated
-        "pit": True,
+    assert {kind: recipes.tuned(sub) for kind, sub in kinds.items()} == {
+        "jam wall": recipes.TUNED_WALL,
+        "jam obstacle": recipes.TUNED_OBSTACLE,
+        "wall": recipes.TUNED_WALL,
+        "bomb": recipes.TUNED_OBSTACLE,  # it stays, but its rollouts are too many to enumerate
+        "pit": recipes.TUNED_WALL,
     }
+    (sub,) = probe.sub_rmdps(probe.make_params()).values()
+
+    class Hole:
+        """A hazard that stays, and has no grid."""
+
+        static, horizon = True, 2
+
+    assert recipes.tuned(sub.replace(source=Hole())) is recipes.TUNED_FIXED
 
 
 def test_a_hazard_that_does_not_say_that_it_stays_may_move():

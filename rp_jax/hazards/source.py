@@ -15,10 +15,12 @@ class HazardSource(Protocol):
     """One kind of hazard: how it moves, when it strikes, and how a threat model sees it.
 
     All methods are unbatched. A hazard never depends on other hazards (Assumption 1); its event,
-    such as a collision, is E_n. Two more members are optional. `static` (bool, False by default)
+    such as a collision, is E_n. Three more members are optional. `static` (bool, False by default)
     says that hazards of this kind do not move, so that their threats can be enumerated.
     `mirrored(features)` returns the features (..., F) of the left-right mirrored situation; without
-    it the kind has no such symmetry.
+    it the kind has no such symmetry. `grid(model, nodes)` returns (low (F,), step (F,), shape): the
+    first node, the steps and the numbers of nodes of a grid of about so many features, on which
+    threats are tabled; without it they are fitted by a network.
     """
 
     @property

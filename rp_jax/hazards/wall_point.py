@@ -1,7 +1,10 @@
 """Walls, represented by fixed points."""
 
+import math
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
 
@@ -118,6 +121,28 @@ class WallPoint(struct.PyTreeNode):
         where, fast = jax.random.split(key)
         vehicle = make_vehicle(jnp.zeros(2), 0.0, sample_speed(fast, model.speeds))
         return vehicle, self.window_at(vehicle.speed).sample(where)
+
+    def grid(
+        self, model: VehicleModel, nodes: int
+    ) -> tuple[np.ndarray, np.ndarray, tuple[int, int, int]]:
+        """Returns a grid over the window, reachable speeds and those half-way, for threats.
+
+        Args:
+            model: the body's model.
+            nodes: about how many.
+
+        Returns:
+            The first node (3,), the steps between nodes (3,), and the numbers of nodes.
+        """
+        speeds = np.asarray(model.speeds, float)
+        gap = float(np.min(np.diff(speeds))) / 2 if len(speeds) > 1 else 1.0
+        fast = round((speeds[-1] - speeds[0]) / gap) + 1
+        lower, upper = (np.asarray(edge, float) for edge in (self.window.lower, self.window.upper))
+        each = math.sqrt(np.prod(upper - lower) * fast / nodes)
+        ahead, aside = (math.ceil(side / each) + 1 for side in upper - lower)
+        # The middle row of nodes lies straight ahead, so that mirror images are at nodes too.
+        low = [lower[0], -each * (aside - 1) / 2, speeds[0]]
+        return np.asarray(low), np.asarray([each, each, gap]), (ahead, aside, fast)
 
     def state_of(self, features: Array) -> tuple[Vehicle, Array]:
         """Returns a body, at the origin, and a point that have given features.

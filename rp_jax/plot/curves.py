@@ -290,9 +290,12 @@ def fit_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path) 
     """Draws training and validation loss of the threat models, by kind of hazard.
 
     Args:
-        curves: by kind of hazard, rows with step, loss and validation_loss.
-        path: where to write the PNG.
+        curves: by kind of hazard, rows with step, loss and validation_loss; tables have none.
+        path: where to write the PNG; not written where nothing was fitted.
     """
+    curves = {kind: rows for kind, rows in curves.items() if rows}
+    if not curves:
+        return
     figure, axes = plt.subplots(
         1, len(curves), figsize=(4.5 * len(curves), 3.4), layout="constrained", squeeze=False
     )

@@ -110,7 +110,7 @@ def settings_of(
     for kind, sub in subs.items():
         own = config.get(kind) if isinstance(config, Mapping) else config
         found[kind] = own or recipes.tuned(sub)
-        found[kind].validate(kind)
+        build.check_config(kind, found[kind], sub)
     return found
 
 

@@ -1,5 +1,6 @@
 """Learned threat functions as files, for use with other thresholds, tracks or hazard counts."""
 
+import math
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +13,15 @@ import numpy as np
 from rp_jax import storage
 from rp_jax.dynamics import num_threats
 from rp_jax.hazards import SubRMDP
-from rp_jax.threat.model import ACTIVATIONS, DEEPEST, WIDEST, ThreatModel, ThreatNetwork
+from rp_jax.threat.model import (
+    ACTIVATIONS,
+    DEEPEST,
+    MOST_NODES,
+    WIDEST,
+    ThreatModel,
+    ThreatNetwork,
+    ThreatTable,
+)
 
 KIND = "threat function"
 
@@ -36,10 +45,7 @@ def save(
     Raises:
         storage.StorageError: the folder or a file cannot be written.
     """
-    networks = {
-        kind: {"hidden": model.network.hidden, "activation": model.network.activation}
-        for kind, model in models.items()
-    }
+    networks = {kind: _described(model.network) for kind, model in models.items()}
     statics = {kind: _texts(subs[kind]) for kind in models}
     facts = {**about, "environment": environment, "networks": networks, "statics": statics}
     storage.save(folder, KIND, _tree(models, subs), facts)
@@ -181,8 +187,42 @@ def _texts(sub: SubRMDP) -> dict[str, str]:
     return {name: storage.text(value) for name, value in storage.statics(sub).items()}
 
 
+def _described(network: ThreatNetwork | ThreatTable) -> dict[str, Any]:
+    """Returns the facts from which `_blank` makes a network or a table."""
+    if isinstance(network, ThreatTable):
+        return {"shape": network.shape}
+    return {"hidden": network.hidden, "activation": network.activation}
+
+
 def _blank(folder: Path, kind: str, facts: Any, sub: SubRMDP) -> ThreatModel:
     """Returns a model of the saved structure, with shapes in place of its weights."""
+    features = jax.eval_shape(
+        lambda key: sub.source.features(*sub.source.sample(key, sub.body)), jax.random.key(0)
+    )
+    network = _network(f"{folder}: {kind}", facts, num_threats(sub.body), features.shape[0])
+    shapes = jax.eval_shape(network.init, jax.random.key(0), features)
+    return ThreatModel(sub.source, shapes, features, jnp.zeros(()), network)
+
+
+def _network(where: str, facts: Any, actions: int, size: int) -> ThreatNetwork | ThreatTable:
+    """Returns a network or a table from its saved facts, checked.
+
+    Args:
+        where: beginning of a message.
+        facts: as `_described` returned them.
+        actions: number of threats.
+        size: number of features.
+    """
+    if isinstance(facts, dict) and "shape" in facts:
+        shape = facts["shape"]
+        good = isinstance(shape, list) and len(shape) == size
+        good = good and all(type(count) is int and count > 0 for count in shape)
+        if not good or math.prod(shape) > MOST_NODES:
+            raise storage.StorageError(
+                f"{where}: shape is {shape!r}; it must list {size} numbers of nodes, at most "
+                f"{MOST_NODES:,} in all"
+            )
+        return ThreatTable(tuple(shape), actions)
     hidden = facts.get("hidden") if isinstance(facts, dict) else None
     if (
         not isinstance(hidden, list)
@@ -190,17 +230,12 @@ def _blank(folder: Path, kind: str, facts: Any, sub: SubRMDP) -> ThreatModel:
         or not all(type(width) is int and 0 < width <= WIDEST for width in hidden)
     ):
         raise storage.StorageError(
-            f"{folder}: {kind}: hidden is {hidden!r}; it must list up to {DEEPEST} widths "
+            f"{where}: hidden is {hidden!r}; it must list up to {DEEPEST} widths "
             f"of at most {WIDEST}"
         )
     if facts.get("activation") not in list(ACTIVATIONS):
         raise storage.StorageError(
-            f"{folder}: {kind}: activation is {facts.get('activation')!r}; it must be one of "
+            f"{where}: activation is {facts.get('activation')!r}; it must be one of "
             f"{sorted(ACTIVATIONS)}"
         )
-    network = ThreatNetwork(tuple(hidden), num_threats(sub.body), facts["activation"])
-    features = jax.eval_shape(
-        lambda key: sub.source.features(*sub.source.sample(key, sub.body)), jax.random.key(0)
-    )
-    shapes = jax.eval_shape(network.init, jax.random.key(0), features)
-    return ThreatModel(sub.source, shapes, features, jnp.zeros(()), network)
+    return ThreatNetwork(tuple(hidden), actions, facts["activation"])

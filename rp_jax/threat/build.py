@@ -19,7 +19,7 @@ from rp_jax.hazards import SubRMDP
 from rp_jax.recon import labels, sampling
 from rp_jax.threat import fit, report
 from rp_jax.threat.fit import Dataset, FitConfig
-from rp_jax.threat.model import ThreatModel
+from rp_jax.threat.model import ThreatModel, ThreatTable
 from rp_jax.validate import finite, number, one_of, random_key, shared_length
 
 Progress = Callable[[str, int, int], None]  # called with (stage, done, total)
@@ -32,7 +32,9 @@ class ThreatConfig:
     """Settings for learning the threat function of one kind of hazard.
 
     Attributes:
-        states: number of labelled start states.
+        tabled: label a grid of states, and look threats up at its nearest node, in place of fitting
+            a network; for hazards whose threats are enumerated and whose source has a `grid`.
+        states: number of labelled start states, or about that of the grid's nodes.
         paths: rollouts per state where the label is not exact.
         exact: label exactly where all rollouts can be enumerated.
         sampling: how start states are drawn: preferential or uniform.
@@ -43,6 +45,7 @@ class ThreatConfig:
         fit: settings of the fit.
     """
 
+    tabled: bool = False
     states: int = 200_000
     paths: int = 64
     exact: bool = True
@@ -65,6 +68,33 @@ class ThreatConfig:
         self.fit.validate(f"{name}.fit")
         first = self.states // 2 if self.sampling == "preferential" else self.states
         number(f"{name}.fit.validation", self.fit.validation, least=1 / first)
+
+
+def check_config(kind: str, config: ThreatConfig, sub: SubRMDP) -> None:
+    """Raises ValueError, naming the field, if settings do not suit a kind of hazard.
+
+    Args:
+        kind: of hazard, for the message.
+        config: its settings.
+        sub: its sub-R-MDP.
+    """
+    config.validate(kind)
+    if config.tabled and not config.exact:
+        raise ValueError(f"{kind}.exact is False; with tabled it must be True")
+    if config.tabled and not can_table(sub):
+        raise ValueError(
+            f"{kind}.tabled is True; it must be False for hazards whose threats are not enumerated "
+            "or whose source has no `grid`"
+        )
+
+
+def can_table(sub: SubRMDP) -> bool:
+    """Returns whether the threats of a sub-R-MDP can be tabled on a grid of features.
+
+    Args:
+        sub: the sub-R-MDP.
+    """
+    return hasattr(sub.source, "grid") and labels.is_enumerable(sub)
 
 
 class LearnedThreat(NamedTuple):
@@ -162,6 +192,42 @@ def fitted(
     return model.replace(params=params), curve
 
 
+def tabled(
+    key: Array,
+    sub: SubRMDP,
+    nodes: int,
+    on_progress: Progress | None = None,
+    mesh: Mesh | None = None,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
+) -> ThreatModel:
+    """Returns a table of exact threats on the grid of a hazard's features.
+
+    Args:
+        key: passed on to the estimator, which does not use it.
+        sub: the sub-R-MDP, for which `can_table` holds.
+        nodes: about how many.
+        on_progress: called with ("labels", states done, states).
+        mesh: devices that share the nodes; None for one device.
+        checkpoints: where to save labels that are done.
+    """
+    low, step, shape = sub.source.grid(sub.body, nodes)
+    axes = [low[k] + step[k] * np.arange(count) for k, count in enumerate(shape)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(shape))
+    features = jnp.asarray(grid, float)
+    some = features[:: max(1, len(features) // 100)]
+    again = jax.vmap(sub.source.features)(*sampling.states(sub, some))
+    if again.shape != some.shape or not np.allclose(again, some, atol=1e-4):
+        raise ValueError("grid of the source: its nodes must be features, which state_of inverts")
+    estimator = labels.exact_threat
+    data = _labelled(key, features, sub, estimator, "labels", on_progress, mesh, checkpoints)
+    smallest = float(jnp.finfo(data.threat.dtype).eps)  # whose logit is still finite
+    threat = jnp.clip(data.threat, smallest, 1 - smallest)
+    values = {"low": low, "step": step, "logits": jnp.log(threat) - jnp.log1p(-threat)}
+    params = {"params": {name: jnp.asarray(value, float) for name, value in values.items()}}
+    network = ThreatTable(shape, data.threat.shape[1])
+    return ThreatModel(sub.source, params, jnp.ones(len(shape)), jnp.zeros(()), network)
+
+
 class Calibration(NamedTuple):
     """A statement on a calibrated model, for states drawn like those it was calibrated on."""
 
@@ -243,6 +309,35 @@ def _thinned(
     return pool, jax.random.bernoulli(keep_key, odds)
 
 
+def _training_data(
+    keys: Array,
+    sub: SubRMDP,
+    config: ThreatConfig,
+    x: float,
+    estimator: labels.Estimator,
+    on_progress: Progress | None,
+    mesh: Mesh | None,
+    checkpoints: Checkpoints,
+) -> Dataset:
+    """Returns the labelled states that a network is fitted to."""
+    first = config.states // 2 if config.sampling == "preferential" else config.states
+    features = sampling.uniform(keys[0], sub, first)
+    at = checkpoints.at
+    data = _labelled(keys[1], features, sub, estimator, "labels", on_progress, mesh, checkpoints)
+    if config.sampling == "preferential":
+        short = dataclasses.replace(config.fit, steps=max(1, config.fit.steps // 4))
+        scout, _ = fitted(keys[2], sub, data, short, on_progress, checkpoints=at("scout"))
+        more = _preferential(
+            keys[3], sub, scout, data.features, data.threat, x, count=config.states - first
+        )
+        extra = _labelled(
+            keys[4], more, sub, estimator, "more labels", on_progress, mesh, checkpoints
+        )
+        data = Dataset(*map(jnp.concatenate, zip(data, extra, strict=True)))
+    jax.block_until_ready(data)
+    return data
+
+
 def learn_threat(
     key: Array,
     sub: SubRMDP,
@@ -277,24 +372,16 @@ def learn_threat(
     keys = jax.random.split(key, 9)
     estimator = labels.best_estimator(sub, config.paths, config.exact)
     accurate = labels.best_estimator(sub, config.test_paths)
-    began = time.perf_counter()
-    first = config.states // 2 if config.sampling == "preferential" else config.states
-    features = sampling.uniform(keys[0], sub, first)
-    at = checkpoints.at
-    data = _labelled(keys[1], features, sub, estimator, "labels", on_progress, mesh, checkpoints)
-    if config.sampling == "preferential":
-        short = dataclasses.replace(config.fit, steps=max(1, config.fit.steps // 4))
-        scout, _ = fitted(keys[2], sub, data, short, on_progress, checkpoints=at("scout"))
-        more = _preferential(
-            keys[3], sub, scout, data.features, data.threat, x, count=config.states - first
-        )
-        extra = _labelled(
-            keys[4], more, sub, estimator, "more labels", on_progress, mesh, checkpoints
-        )
-        data = Dataset(*map(jnp.concatenate, zip(data, extra, strict=True)))
-    jax.block_until_ready(data)
-    labelled = time.perf_counter()
-    model, curve = fitted(keys[5], sub, data, config.fit, on_progress, checkpoints=at("fit"))
+    began, at = time.perf_counter(), checkpoints.at
+    if config.tabled:
+        check_config("config", config, sub)
+        model = tabled(keys[1], sub, config.states, on_progress, mesh, checkpoints)
+        labelled = time.perf_counter()
+        curve: list[dict[str, float]] = []
+    else:
+        data = _training_data(keys, sub, config, x, estimator, on_progress, mesh, checkpoints)
+        labelled = time.perf_counter()
+        model, curve = fitted(keys[5], sub, data, config.fit, on_progress, checkpoints=at("fit"))
     facts = {}
     if config.miss_rate < 1:
         hard = near_threshold(keys[8], sub, model, x, config.test_states)

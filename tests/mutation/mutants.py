@@ -391,7 +391,7 @@ MUTANTS = [
     ),
     *_of(
         "runs/certify.py",
-        "tests/cli/test_commands.py tests/runs",
+        "tests/runs/test_certify.py",
         (
             "one crash more than planned",
             "shows = crashes <= allowed",
