@@ -69,7 +69,7 @@ def run(config: Config) -> list[dict[str, Any]]:
         (
             "Circuit wall",
             circuit.sub_rmdps(circuit.make_params())["wall"],
-            recipes.TUNED_FIXED,
+            recipes.TUNED_WALL,
             1e-3,
         ),
         (

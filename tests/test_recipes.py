@@ -30,14 +30,6 @@ def test_threats_that_are_enumerated_have_one_recipe_and_those_that_are_sampled_
         "bomb": recipes.TUNED_OBSTACLE,  # it stays, but its rollouts are too many to enumerate
         "pit": recipes.TUNED_WALL,
     }
-    (sub,) = probe.sub_rmdps(probe.make_params()).values()
-
-    class Hole:
-        """A hazard that stays, and has no grid."""
-
-        static, horizon = True, 2
-
-    assert recipes.tuned(sub.replace(source=Hole())) is recipes.TUNED_FIXED
 
 
 def test_a_hazard_that_does_not_say_that_it_stays_may_move():

@@ -12,10 +12,7 @@ from rp_jax.cli import experiment
 MODULES = {"circuit": circuit, "jam": jam, "point_gather": point_gather}
 KINDS = {"circuit": ["wall"], "jam": ["wall", "obstacle"], "point_gather": ["bomb"]}
 TINY_FIT = "--{0}.fit.steps 40 --{0}.fit.batch 64 --{0}.fit.hidden 16"
-TINY_THREAT = (
-    "--{0}.no-tabled --{0}.states 200 --{0}.paths 4 --{0}.test-states 200 --{0}.test-paths 8 "
-    + TINY_FIT
-)
+TINY_THREAT = "--{0}.states 200 --{0}.paths 4 --{0}.test-states 200 --{0}.test-paths 8 " + TINY_FIT
 TINY = (
     "--planning.steps 480 --planning.num-envs 8 --planning.batch 32 --planning.replay 512 "
     "--planning.replay-start 64 --planning.n-step 2 --episodes 16 --seeds 2 --x 0.9"

@@ -51,8 +51,7 @@ COMMANDS: dict[str, str] = {
     "unmasked": "jam {few} {jam_steps} --threat @jam/threat --planning.learner.no-masked-target"
     " --no-figures",
     "plans": "jam {few} {jam_steps} {obstacle} --baseline plans --no-figures",
-    "sampled_walls": "jam {few} {jam_steps} {wall} {obstacle} --wall.no-tabled --wall.no-exact"
-    " --no-figures",
+    "sampled_walls": "jam {few} {jam_steps} {wall} {obstacle} --wall.no-exact --no-figures",
     "few_states": "jam {few} {jam_steps} {wall} {obstacle} {few_states} --no-figures",
     "uniform": "jam {few} {jam_steps} {wall} {obstacle} --obstacle.sampling uniform --no-figures",
     "horizon_5": "jam {few} {jam_steps} {wall} {obstacle} --obstacle-horizon 5 --no-figures",
