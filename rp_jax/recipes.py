@@ -16,8 +16,8 @@ TUNED_WALL = ThreatConfig(  # of hazards whose threats are enumerated
     miss_rate=1.0,
     fit=FitConfig(hidden=(64, 64, 32), steps=12_000, batch=2048, learning_rate=5e-3),
 )
-# Of the same hazards, where their source has a grid: nearer to the truth, and faster; but networks
-# err on the safe side (docs/recon.md).
+# Of the same hazards, where their source has a grid: nearer to the truth, and faster; but agents
+# crash more often behind it, for reasons that are not known yet (docs/recon.md).
 TUNED_TABLE = ThreatConfig(tabled=True, states=200_000, sampling="uniform", miss_rate=1.0)
 TUNED_BOMB = ThreatConfig(
     states=100_000,
