@@ -68,7 +68,9 @@ class Agent(struct.PyTreeNode):
         return _acted(self, states)
 
     def __repr__(self) -> str:
-        who = f"RP, x = {self.pmdp.x}" if self.pmdp.shielded else "without a shield"
+        x = self.pmdp.x
+        x = x if isinstance(x, jax.core.Tracer) else f"{float(x):.4g}"
+        who = f"RP (x={x})" if self.pmdp.shielded else "without a shield"
         return f"Agent({short_name(self.pmdp.env)}: {who})"
 
     def look(self, states: Any) -> Percept:

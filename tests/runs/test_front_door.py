@@ -266,7 +266,8 @@ def test_a_folder_with_agents_and_a_threat_function_loads_the_agents(agents, par
 
 def test_what_is_written_says_what_it_is(agents, threat):
     assert repr(agents) == "Agents(probe: 2 of RP (x=0.5))"
-    assert repr(agents[0]) == "Agent(probe: RP, x = 0.5)"
+    assert repr(agents[0]) == "Agent(probe: RP (x=0.5))"
+    jax.eval_shape(lambda agent: [repr(agent)] and agent.pmdp.x, agents[0])  # traced, as well
     assert re.fullmatch(r"ThreatFunction\(pit \(mean absolute error .* 0\.\d+\)\)", repr(threat))
     for config in (LoopConfig, ThreatConfig, FitConfig, rp_jax.DQNConfig):
         for field in dataclasses.fields(config):
