@@ -69,8 +69,8 @@ class Agent(struct.PyTreeNode):
 
     def __repr__(self) -> str:
         x = self.pmdp.x
-        x = x if isinstance(x, jax.core.Tracer) else f"{float(x):.4g}"
-        who = f"RP (x={x})" if self.pmdp.shielded else "without a shield"
+        number = str(x) if isinstance(x, jax.core.Tracer) else f"{float(x):.4g}"
+        who = f"RP (x={number})" if self.pmdp.shielded else "without a shield"
         return f"Agent({short_name(self.pmdp.env)}: {who})"
 
     def look(self, states: Any) -> Percept:
