@@ -367,14 +367,13 @@ def learn_threat(
         FloatingPointError: a label, a loss or a weight is not a finite number.
     """
     random_key("key", key)
-    config.validate("config")
+    check_config("config", config, sub)
     number("x", x, least=0, infinite=True)
     keys = jax.random.split(key, 9)
     estimator = labels.best_estimator(sub, config.paths, config.exact)
     accurate = labels.best_estimator(sub, config.test_paths)
     began, at = time.perf_counter(), checkpoints.at
     if config.tabled:
-        check_config("config", config, sub)
         model = tabled(keys[1], sub, config.states, on_progress, mesh, checkpoints)
         labelled = time.perf_counter()
         curve: list[dict[str, float]] = []

@@ -98,7 +98,7 @@ def hasty_controls(trial: Trial) -> list[str]:
             found.append(
                 f"sub_rmdps(params)[{kind!r}].body.delayed is True, but a control decides at once "
                 "whether a hazard is hit: after one step under two actions, `hits` differs in "
-                f" {number_of(unlike, HASTY, 'pairs')}; `delayed` must be False, as the last "
+                f"{number_of(unlike, HASTY, 'pairs')}; `delayed` must be False, as the last "
                 "control is left out of the enumerated threats of a body that is delayed"
             )
     return found
