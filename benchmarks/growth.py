@@ -2,22 +2,26 @@
 
 import argparse
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import env_step, seeds, train_step
-from benchmarks.measure import Row
+from benchmarks.bound import Piece
+from benchmarks.measure import Row, measure
 from benchmarks.report import machine
-from benchmarks.setups import pmdp_of, quick_tasks
+from benchmarks.setups import more_chunks, pmdp_of, quick_tasks
 from rp_jax import storage
 from rp_jax.cli import terminal
 from rp_jax.envs import jam
 
 ENVS = tuple(4**k for k in range(8))  # 1 .. 16,384
-OBSTACLES = (1, 2, 4, 8, 16, 32, 64)
+OBSTACLES = (8, 16, 32, 64, 128, 256, 512)
 SEEDS = (1, 2, 4, 8, 16)
 REPLAYS = (2**14, 2**16, 2**18, 2**20)  # transitions
 BATCH = 256  # environments, where obstacles grow
@@ -79,11 +83,38 @@ def envs(sizes: Sequence[int] = ENVS) -> Series:
     return series("Jam N=8, observed", "environments", "step of all", sizes, rows, 1)
 
 
+def room_for(count: int) -> jam.Params:
+    """Returns Jam among so many obstacles, in a room in which they stand as densely as 8 in 3 x 3.
+
+    Args:
+        count: number of obstacles.
+    """
+    return jam.make_params(count, room=jam.ROOM * math.sqrt(count / 8))
+
+
 def obstacles(sizes: Sequence[int] = OBSTACLES) -> Series:
     """A step of a batch of Jam, with observations."""
-    rows = [env_step.row("jam", jam, jam.make_params(n), True, BATCH) for n in sizes]
-    title = f"Jam, observed, {BATCH} environments"
+    rows = [env_step.row("jam", jam, room_for(n), True, BATCH) for n in sizes]
+    title = f"Jam at equal density, observed, {BATCH} environments"
     return series(title, "obstacles", "step of all", sizes, rows, 1)
+
+
+def threats(sizes: Sequence[int] = OBSTACLES) -> Series:
+    """Threats and observations of a batch of Jam, the vehicle in the middle of the room."""
+    world, config = quick_tasks()["jam"]
+    pmdp, rows = pmdp_of(world, config), []
+    for size in sizes:
+        now = pmdp.replace(params=room_for(size))
+        states = jax.jit(jax.vmap(jam.reset, (0, None)))(
+            jax.random.split(jax.random.key(0), BATCH), now.params
+        )
+        middle = jnp.broadcast_to(now.params.room / 2, (BATCH, 2))
+        states = states.replace(body=states.body.replace(position=middle))
+        program = lambda pmdp, states: pmdp.perceive(states)  # noqa: E731
+        pieces = [Piece(program, (now, states)), *more_chunks(now, states)]
+        rows.append(measure("jam", "states", BATCH, BATCH, program, now, states, repeats=20, pieces=pieces))
+    title = f"Jam at equal density, {BATCH} states"
+    return series(title, "obstacles", "look and threats of all", sizes, rows, 1)
 
 
 def side_by_side(sizes: Sequence[int] = SEEDS) -> Series:
@@ -111,7 +142,7 @@ def main() -> None:
     out = parser.parse_args().out
     from rp_jax.plot.growth import growth  # after the arguments: --help needs no matplotlib
 
-    found = [asdict(grow()) for grow in (envs, obstacles, side_by_side, replay)]
+    found = [asdict(grow()) for grow in (envs, obstacles, threats, side_by_side, replay)]
     lines = [{name: one[name] for name in ("title", "size", "vertical", "slope")} for one in found]
     terminal.table("growth", lines, list(lines[0]))
     out.mkdir(parents=True, exist_ok=True)

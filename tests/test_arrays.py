@@ -84,6 +84,12 @@ def test_ranks_put_values_in_ascending_order(values):
     np.testing.assert_array_equal(rank, np.argsort(np.argsort(values, kind="stable")))
 
 
+@given(hnp.arrays(np.float32, st.sampled_from([9, 40]), elements=st.integers(-3, 3)))
+def test_smallest_values_come_first_and_equals_as_they_stand(values):
+    found = np.asarray(arrays.smallest(jnp.asarray(values), 4))
+    np.testing.assert_array_equal(found, np.argsort(values, kind="stable")[:4])
+
+
 @pytest.mark.parametrize(
     ("where", "chunk", "indices", "count"),
     [

@@ -1,5 +1,7 @@
 """Jam: leave a room through its exit among randomly moving obstacles (paper, appendix F)."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,8 +27,9 @@ from rp_jax.envs.walls import FARTHEST, least_radius
 from rp_jax.hazards import MovingObstacle, SubRMDP, WallPoint
 from rp_jax.validate import number, one_of, positive
 
-ROOM = 3.0  # side of the square room, room units
-EXIT = (2.2, 3.0)  # the gap in the top wall, from and to x
+ROOM = 3.0  # side of the square room by default, room units
+MOST_ROOM = 30.0  # greatest side: tables of walls grow with it
+EXIT = 0.8  # width of the gap at the right end of the top wall
 SPACING = 0.02  # distance between the walls' points, room units
 ACCELERATIONS = (-0.02, 0.0, 0.02)  # room units / step^2
 TURNS = (-0.3, -0.1, 0.0, 0.1, 0.3)  # radians / step
@@ -83,17 +86,25 @@ class Params(struct.PyTreeNode):
     radius: Array  # () radius of every vehicle, room units
     beta: Array  # () discount of danger in the threat
     fewest: Array  # () int32, least number of obstacles that an episode begins with
+    room: Array  # () side of the square room, room units
     num_obstacles: int = struct.field(pytree_node=False, default=8)
     fidelity: str = struct.field(pytree_node=False, default="released")  # or "paper"
 
 
-def wall_points() -> np.ndarray:
-    """Returns the points of the room's walls, (559, 2), one every `SPACING`, without the exit."""
-    way = np.arange(150) * SPACING
+def wall_points(room: float = ROOM) -> np.ndarray:
+    """Returns the points of the room's walls, one every `SPACING`, without the exit.
+
+    Args:
+        room: side of the room, room units.
+
+    Returns:
+        (P, 2) room units; P is 559 for a side of 3.
+    """
+    way = np.arange(math.ceil(room / SPACING - 1e-9)) * SPACING
     bottom, left = np.stack([way, 0 * way], 1), np.stack([0 * way, way], 1)
-    top = np.stack([way, 0 * way + ROOM], 1)
-    right = np.stack([0 * way + ROOM, way], 1)
-    walls = np.concatenate([bottom, top[way < EXIT[0] - 1e-9], left, right])
+    top = np.stack([way, 0 * way + room], 1)
+    right = np.stack([0 * way + room, way], 1)
+    walls = np.concatenate([bottom, top[way < room - EXIT - 1e-9], left, right])
     _, first = np.unique(walls.round(9), axis=0, return_index=True)
     return walls[np.sort(first)]
 
@@ -103,6 +114,7 @@ def make_params(
     *,
     time_limit: int = 100,
     radius: float = 0.1,
+    room: float = ROOM,
     beta: float = 0.999,
     fewest: int | None = None,
     wall_horizon: int = 5,
@@ -116,6 +128,8 @@ def make_params(
         num_obstacles: number of obstacles; 8 in the paper, 3 and 15 for transfer.
         time_limit: steps of an episode.
         radius: radius of every vehicle, room units.
+        room: side of the square room, room units; the exit and the goal stay at its upper right
+            corner.
         beta: discount of danger in the threat.
         fewest: each episode begins with a number of obstacles drawn from `fewest` to
             `num_obstacles`, so that a learner meets sparse rooms as well; by default with all.
@@ -134,8 +148,10 @@ def make_params(
     one_of("baseline", baseline, contract.BASELINES)
     positive("time_limit", time_limit, most=10**9, integer=True)
     number("radius", radius, above=least_radius(SPACING, SPEEDS[-1]), most=0.2)
-    room = int((ROOM / (2 * radius)) ** 2)  # how many fit side by side
-    number("num_obstacles", num_obstacles, least=1, most=room, integer=True)
+    # Smaller rooms may have no place at `CLEARANCE` from the vehicle.
+    room = number("room", room, least=2.0, most=MOST_ROOM)
+    fitting = int((room / (2 * radius)) ** 2)  # how many fit side by side
+    number("num_obstacles", num_obstacles, least=1, most=fitting, integer=True)
     positive("beta", beta, most=1.0)
     fewest = num_obstacles if fewest is None else fewest
     number("fewest", fewest, least=0, most=num_obstacles, integer=True)
@@ -164,13 +180,13 @@ def make_params(
     obstacle = MovingObstacle.create(
         body, jnp.asarray(OBSTACLE_SPEEDS, float), behaviour, 2 * radius, obstacle_horizon
     )
-    walls = wall_points()
+    walls = wall_points(room)
     return Params(
         body=body,
         wall=wall,
         obstacle=obstacle,
         start=make_vehicle((0.2, 0.2), 0.0, 0.0),
-        goal=jnp.asarray((2.6, 3.0), float),
+        goal=jnp.asarray((room - EXIT / 2, room), float),
         walls=sensing.distance_field(walls, radius) if plans else None,
         walls_in_view=sensing.points_within(walls, 1.0, 0.2),
         walls_in_contact=sensing.points_within(walls, radius, 0.1),
@@ -180,6 +196,7 @@ def make_params(
         radius=jnp.asarray(radius, float),
         beta=jnp.asarray(beta, float),
         fewest=jnp.asarray(fewest, jnp.int32),
+        room=jnp.asarray(room, float),
         num_obstacles=num_obstacles,
         fidelity=fidelity,
     )
@@ -213,38 +230,43 @@ def _anywhere(key: Array, params: Params) -> Vehicle:
     speeds = params.obstacle.speeds
     uniform = jax.random.uniform(key, (4,), speeds.dtype)
     return make_vehicle(
-        params.radius + uniform[:2] * (ROOM - 2 * params.radius),
+        params.radius + uniform[:2] * (params.room - 2 * params.radius),
         (2 * uniform[2] - 1) * jnp.pi,
         speeds[(uniform[3] * len(speeds)).astype(jnp.int32)],
     )
 
 
-def _appear(key: Array, body: Vehicle, needed: Array, params: Params) -> Vehicle:
+def _appear(key: Array, body: Vehicle, needed: Array, params: Params, block: int) -> Vehicle:
     """Draws places for obstacles, at least `CLEARANCE` away from the agent's vehicle.
 
-    It rejects unsuitable places, for one obstacle after another: few are needed at a time, and the
-    place of obstacle n does not depend on how many come after it. Rows that are not needed are
-    meaningless.
+    The suitable ones of a row of places go to the obstacles in their order, so that the place of
+    obstacle n does not depend on how many come after it. Rows that are not needed are meaningless.
 
     Args:
         key: random key.
         body: state of the agent's vehicle.
         needed: (N,) bool, the obstacles to be placed.
         params: the task's parameters.
+        block: number of places that are drawn at once; it changes the speed alone.
     """
+    size = needed.shape[0]
+    order, wanted = arrays.compact_indices(needed, 1, size)
 
     def attempt(carry):
-        count, left, placed = carry
-        place = _anywhere(jax.random.fold_in(key, count), params)
+        drawn, found, placed = carry
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(key, drawn + jnp.arange(block))
+        places = jax.vmap(_anywhere, (0, None))(keys, params)
+        squared = jax.vmap(squared_distance, (0, None))(places.position, body.position)
         # Written so that a position of nan ends the search; otherwise it would never end.
-        free = ~(squared_distance(place.position, body.position) < CLEARANCE**2)
-        now = (jnp.arange(len(left)) == jnp.argmax(left)) & free
-        placed = jax.vmap(arrays.select, (0, None, 0))(now, place, placed)
-        return count + 1, left & ~now, placed
+        free = ~(squared < CLEARANCE**2)
+        slots = order.at[found + jnp.cumsum(free) - 1].get(mode="fill", fill_value=size)
+        rows = jnp.where(free, slots, size)
+        placed = jax.tree.map(lambda old, new: old.at[rows].set(new, mode="drop"), placed, places)
+        return drawn + block, found + jnp.sum(free), placed
 
-    count = needed.shape[0]
-    blank = jax.tree.map(lambda a: jnp.zeros((count, *a.shape), a.dtype), body)
-    return jax.lax.while_loop(lambda c: jnp.any(c[1]), attempt, (0, needed, blank))[2]
+    blank = jax.tree.map(lambda a: jnp.zeros((size, *a.shape), a.dtype), body)
+    begin = (jnp.asarray(0), jnp.asarray(0), blank)
+    return jax.lax.while_loop(lambda c: c[1] < wanted, attempt, begin)[2]
 
 
 def reset(key: Array, params: Params) -> State:
@@ -255,7 +277,8 @@ def reset(key: Array, params: Params) -> State:
         params: the task's parameters.
     """
     needed = jnp.ones(params.num_obstacles, bool)
-    state = start_at(params.start, _appear(key, params.start, needed, params), params)
+    placed = _appear(key, params.start, needed, params, params.num_obstacles)
+    state = start_at(params.start, placed, params)
     count_key = jax.random.fold_in(key, COUNT)
     count = jax.random.randint(count_key, (), params.fewest, params.num_obstacles + 1)
     return state.replace(present=jnp.arange(params.num_obstacles) < count)
@@ -263,9 +286,9 @@ def reset(key: Array, params: Params) -> State:
 
 def _out_of_place(position: Array, params: Params) -> Array:
     """Returns whether an obstacle at `position` (2,) has left the room or entered a safety zone."""
-    low, high = params.radius, ROOM - params.radius
+    low, high = params.radius, params.room - params.radius
     outside = jnp.any((position <= low) | (position >= high))
-    corners = jnp.asarray([[0.0, 0.0], [0.0, ROOM], [ROOM, 0.0]], position.dtype)
+    corners = params.room * jnp.asarray([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]], position.dtype)
     offset = jnp.abs(position[None] - corners)
     if params.fidelity == "released":
         in_zone = jnp.any(jnp.all(offset < ZONE, axis=-1))
@@ -292,7 +315,8 @@ def draw(key: Array, state: State, action: Array, params: Params) -> Draws:
     body = _move_agent(state, action, params)
     moved = _move_obstacles(state, controls, params)
     needed = jax.vmap(_out_of_place, (0, None))(moved.position, params)
-    return Draws(controls=controls, relocated=_appear(place, body, needed, params))
+    block = 1 + params.num_obstacles // 64  # few are needed at a time
+    return Draws(controls=controls, relocated=_appear(place, body, needed, params, block))
 
 
 def _move_agent(state: State, action: Array, params: Params) -> Vehicle:
@@ -337,7 +361,7 @@ def transition(
     )
     hit = collisions(reached, params)
     crashed = hit["wall"] | hit["obstacle"]
-    goal = (body.position[1] > ROOM) & ~crashed
+    goal = (body.position[1] > params.room) & ~crashed
     stopped = jnp.abs(body.speed) < params.stop_speed
     reward = reached.progress - state.progress - 0.05 - 0.05 * stopped + 10.0 * goal
     terminated, truncated = contract.ended(crashed | goal, reached.time, params.time_limit)
@@ -403,12 +427,12 @@ def _seen_obstacles(state: State) -> Array:
     offset = jnp.where(present[:, None], offset, jnp.asarray(UNSEEN, offset.dtype)[None])
     facing = jnp.where(present[:, None], others.heading, -body.heading[None])
     speed = jnp.where(present, others.speed, body.speed)
-    local = to_body_frame(offset, body.heading)
-    turn = angle_of(to_body_frame(facing, body.heading))
-    rows = jnp.concatenate([local, turn[:, None], speed[:, None]], axis=-1)
-    squared = jnp.sum(jnp.square(offset), axis=-1)
-    nearest = arrays.ranks(squared)
-    return jnp.zeros((SEEN_OBSTACLES, 4), rows.dtype).at[nearest].set(rows, mode="drop")
+    rows = jnp.concatenate([offset, facing, speed[:, None]], axis=-1)
+    nearest = arrays.smallest(jnp.sum(jnp.square(offset), axis=-1), SEEN_OBSTACLES)
+    seen = rows.at[nearest].get(mode="clip")
+    local = to_body_frame(seen[:, :2], body.heading)
+    turn = angle_of(to_body_frame(seen[:, 2:4], body.heading))
+    return jnp.concatenate([local, turn[:, None], seen[:, 4:]], axis=-1)
 
 
 def observe(state: State, params: Params) -> Array:

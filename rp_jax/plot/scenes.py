@@ -1,19 +1,23 @@
 """Trajectories of vehicles, and animations of episodes with the threat of every action."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
-from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.artist import Artist
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle, Wedge
+from PIL import Image
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 AGENT, OBSTACLE, ZONE = "#d69e2e", "#63b3ed", "#c6f6d5"
+NONE_BELOW = "\nnone is below: the least is taken"
 GOOD, BAD = "#38a169", "#c53030"
 
 
@@ -196,7 +200,7 @@ def animate(
     table.set_ylabel(rows)
     figure.colorbar(image, ax=table, label="threat", shrink=0.7)
     crosses = [
-        [table.text(j, i, "", ha="center", va="center", color="white") for j in range(shape[1])]
+        [table.text(j, i, "x", ha="center", va="center", color="white") for j in range(shape[1])]
         for i in range(shape[0])
     ]
     frame = table.add_patch(Rectangle((0, 0), 1, 1, fill=False, edgecolor="cyan", linewidth=3))
@@ -216,15 +220,55 @@ def animate(
         image.set_data(np.maximum(threat, 1e-4))
         for i in range(shape[0]):
             for j in range(shape[1]):
-                crosses[i][j].set_text("" if allowed[i, j] else "x")
+                crosses[i][j].set_visible(not allowed[i, j])
         row, column = divmod(int(episode.action[t]), shape[1])
         frame.set_xy((shape[1] - 1 - column - 0.5, row - 0.5))
-        state = "" if episode.secure[t] else "\nnone is below: the least is taken"
-        table.set_title(f"crossed: threat above {x:g}{state}", fontsize=10)
-        world.set_title(f"step {t}" + (", CRASH" if episode.hit[t] else ""))
+        state = "" if episode.secure[t] else NONE_BELOW
+        told.set_text(f"crossed: threat above {x:g}{state}")
+        clock.set_text(f"step {t}" + (", CRASH" if episode.hit[t] else ""))
+
+    # The longest titles come first, so that the layout leaves room for them.
+    told = table.set_title(f"crossed: threat above {x:g}{NONE_BELOW}", fontsize=10)
+    clock = world.set_title("step 0")
+    flat = [cross for row in crosses for cross in row]
+    moving = [trail, *others, body, *noses, image, frame, *flat, clock, told]
+    pictures = []
+    for t, picture in enumerate(_pictures(figure, moving, show, frames)):
+        pictures.append(picture)
         if on_progress:
             on_progress(t + 1, frames)
-
-    animation = FuncAnimation(figure, show, frames=frames, init_func=lambda: None)
-    animation.save(path, writer=PillowWriter(fps=12 if frames > 20 else 3), dpi=80)
     plt.close(figure)
+    pause = 83 if frames > 20 else 333  # milliseconds for a frame
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=pause, loop=0)
+
+
+def _pictures(
+    figure: Figure, moving: Sequence[Artist], show: Callable[[int], None], count: int
+) -> Iterator[Image.Image]:
+    """Draws a figure again and again; what stands still, and the layout, only once.
+
+    Args:
+        figure: with all its artists.
+        moving: the artists that change, from back to front.
+        show: changes them to those of a given frame.
+        count: number of frames.
+
+    Yields:
+        The frames, all with the colours of the first.
+    """
+    figure.set_dpi(80)
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.draw()
+    figure.set_layout_engine("none")
+    for artist in moving:
+        artist.set_animated(True)
+    canvas.draw()
+    still, colours = canvas.copy_from_bbox(figure.bbox), None
+    for t in range(count):
+        canvas.restore_region(still)
+        show(t)
+        for artist in moving:
+            figure.draw_artist(artist)
+        picture = Image.fromarray(np.array(canvas.buffer_rgba())).convert("RGB")
+        colours = colours or picture.quantize(255)
+        yield picture.quantize(palette=colours, dither=Image.Dither.NONE)

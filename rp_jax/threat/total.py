@@ -66,22 +66,27 @@ def _summed(model: ThreatModel, bodies: Any, hazards: Hazards) -> Array:
 
     Only those in reach go through the network: they are few, and are moved to the front first.
     """
-    over_hazards = jax.vmap(model.source.features, (None, 0))
-    features = jax.vmap(over_hazards)(bodies, hazards.state)  # (B, n, F)
     inside = counted(model.source, bodies, hazards)
     batch, n = inside.shape
+    nothing = jnp.zeros((batch, model.network.num_actions))
     if n == 0:
-        return jnp.zeros((batch, model.network.num_actions), features.dtype)
+        return nothing
     order, count = compact_indices(inside.reshape(-1), CHUNK, 0)
-    rows = features.reshape(batch * n, -1)
+    flat = jax.tree.map(lambda a: a.reshape(batch * n, *a.shape[2:]), hazards.state)
 
     def add_chunk(carry):
         start, total = carry
         chosen = jax.lax.dynamic_slice(order, (start,), (CHUNK,))
-        threat = model(rows[chosen])
+        body = _rows(bodies, chosen // n)
+        hazard = _rows(flat, chosen)
+        threat = model(jax.vmap(model.source.features)(body, hazard))
         real = start + jnp.arange(CHUNK) < count
         threat = jnp.where(real[:, None], threat, 0.0)
         return start + CHUNK, total.at[chosen // n].add(threat)
 
-    nothing = jnp.zeros((batch, model.network.num_actions), features.dtype)
     return jax.lax.while_loop(lambda c: c[0] < count, add_chunk, (0, nothing))[1]
+
+
+def _rows(states: Any, chosen: Array) -> Any:
+    """Returns the chosen rows of a batch; all of them exist."""
+    return jax.tree.map(lambda a: a.at[chosen].get(mode="promise_in_bounds"), states)

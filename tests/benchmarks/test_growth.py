@@ -37,7 +37,7 @@ def test_two_sizes_are_enough_and_units_count():
 @pytest.mark.skipif(importlib.util.find_spec("matplotlib") is None, reason="needs matplotlib")
 def test_growth_leaves_a_figure_and_numbers(tmp_path, monkeypatch):
     one = growth.series("title", "envs", "step", [1, 4], rows_of([1, 4], [1.0, 2.0]), 1)
-    for name in ("envs", "obstacles", "side_by_side", "replay"):
+    for name in ("envs", "obstacles", "threats", "side_by_side", "replay"):
         monkeypatch.setattr(growth, name, lambda: one)
     monkeypatch.setattr(growth, "machine", dict)
     monkeypatch.setattr("sys.argv", ["growth", "--out", str(tmp_path / "new")])

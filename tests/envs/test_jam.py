@@ -452,7 +452,10 @@ def test_the_walls_stand_around_the_room_but_not_in_the_exit(golden):
         ({"fidelity": "exact"}, "^fidelity is 'exact'; it must be one of 'released', 'paper'"),
         ({"num_obstacles": 0}, "^num_obstacles is 0; it must be an integer, at least 1"),
         ({"num_obstacles": 2.5}, r"^num_obstacles is 2\.5; it must be an integer"),
-        ({"num_obstacles": 10_000}, "^num_obstacles is 10000; it must be .* at most"),
+        ({"num_obstacles": 10_000}, "^num_obstacles is 10000; it must be .* at most 225"),
+        ({"num_obstacles": 101, "room": 2}, "^num_obstacles is 101; it must be .* at most 100"),
+        ({"room": 1.9}, r"^room is 1\.9; it must be a finite number, at least 2, at most 30"),
+        ({"room": float("nan")}, "^room is nan; it must be a finite number"),
         ({"time_limit": -1}, "^time_limit is -1; it must be an integer, above 0"),
         (
             {"radius": 0.5},
@@ -468,6 +471,52 @@ def test_the_walls_stand_around_the_room_but_not_in_the_exit(golden):
 def test_parameters_out_of_range_are_named(settings, message):
     with pytest.raises(ValueError, match=message):
         jam.make_params(**settings)
+
+
+@pytest.mark.parametrize("fidelity", ["released", "paper"])
+def test_a_larger_room_has_the_same_upper_right_corner(fidelity):
+    small, large = params_of(8, fidelity), jam.make_params(8, room=5.5, fidelity=fidelity)
+    row_keys = keys_of(7, ROWS)
+    states = drive(row_keys, small, 3)
+    states = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), states)
+    shift = np.float32([[2.5, 2.5]])
+    near = jnp.where(jnp.arange(len(states.time)) % 2, 2.9, 2.3)  # at the edge of the exit, and not
+    body = states.body.replace(position=jnp.stack([near, near / near + 1.85], axis=-1))
+    states = states.replace(body=body)
+    moved = states.replace(
+        body=body.replace(position=body.position + shift),
+        obstacles=states.obstacles.replace(position=states.obstacles.position + shift[None]),
+    )
+    here, there = observe(states, small), observe(moved, large)
+    # Distances of the walls in view; those of the walls that moved away are out of view.
+    np.testing.assert_allclose(here[:, :392], there[:, :392], atol=2e-3)
+    np.testing.assert_allclose(here[:, 392:394] + shift, there[:, 392:394], atol=1e-5)
+    at_small = jax.vmap(jam.collisions, (0, None))(states, small)
+    at_large = jax.vmap(jam.collisions, (0, None))(moved, large)
+    np.testing.assert_array_equal(at_small["wall"], at_large["wall"])
+    np.testing.assert_allclose(small.goal + shift[0], large.goal, atol=1e-6)
+
+
+def test_obstacles_use_the_whole_of_a_larger_room_and_stay_in_it():
+    params = jam.make_params(100, room=8.0)
+    states = drive(keys_of(3, 4), params, 40)
+    place = np.asarray(states.obstacles.position)
+    assert place.min() > 0.1
+    assert 7.5 < place.max() < 7.9
+    outside = np.asarray(states.body.position)[..., None, :] - place[0]
+    assert (np.linalg.norm(outside[0], axis=-1) >= jam.CLEARANCE).all()
+
+
+def test_the_goal_is_above_the_top_wall_of_a_larger_room():
+    params = jam.make_params(8, room=5.5)
+    body = at((5.1, 5.48), np.pi / 2, 0.1)
+    state = jam.start_at(body, at(np.full((8, 2), 1.5)), params)
+    reached, outcome = jax.jit(jam.step)(jax.random.key(0), state, COAST, params)
+    assert reached.body.position[1] > 5.5
+    assert outcome.goal
+    assert outcome.terminated
+    # From .02 below the goal (rounded: 0) to .08 above it (1.6, rounded: 2).
+    assert outcome.reward == pytest.approx(10 - 0.05 - 2)
 
 
 def test_episodes_begin_with_as_few_obstacles_as_is_asked_for():

@@ -315,8 +315,8 @@ MUTANTS = [
         ("walls cannot be hit", 'hit["wall"] | hit["obstacle"]', 'hit["obstacle"]'),
         (
             "the goal after a crash",
-            "(body.position[1] > ROOM) & ~crashed",
-            "(body.position[1] > ROOM)",
+            "(body.position[1] > params.room) & ~crashed",
+            "(body.position[1] > params.room)",
         ),
     ),
     *_of(
