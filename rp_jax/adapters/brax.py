@@ -16,7 +16,7 @@ from rp_jax import arrays, shield
 from rp_jax.adapters import registry
 from rp_jax.adapters.quiet import quietly
 from rp_jax.envs import contract, optional
-from rp_jax.validate import number
+from rp_jax.validate import number, positive
 
 with quietly():
     from brax import envs
@@ -189,9 +189,11 @@ def wrap(
         randomization_fn: must be None; vary the environment's parameters instead.
 
     Raises:
-        ValueError: `randomization_fn` is not None, or `action_repeat` is not 1.
+        ValueError: `randomization_fn` is not None, `action_repeat` is not 1, or `episode_length`
+            is not a positive integer.
     """
     number("action_repeat", action_repeat, least=1, most=1, integer=True)
+    positive("episode_length", episode_length, integer=True)
     if randomization_fn is not None:
         raise ValueError("randomization_fn is given; it must be None: vary the parameters instead")
     limit = min(episode_length, getattr(env, "time_limit", episode_length))
@@ -255,7 +257,16 @@ class ShieldWrapper(Wrapper):
         taken = chosen.action if self.table is None else self.table[chosen.action]
         told = {"intervention": chosen.intervened, "insecure": ~chosen.secure}
         told = {name: value.astype(state.done.dtype) for name, value in told.items()}
-        return _tell(self.env.step(state, taken), told)
+        return _tell(self.env.step(_without(state, told), taken), told)
+
+
+def _without(state: State, told: dict[str, Array]) -> State:
+    """Returns a state as the wrapped environment made it, without a shield's entries.
+
+    Wrappers inside count the metrics that they began with, and would not know these.
+    """
+    kept = lambda table: {name: table[name] for name in table if name not in told}  # noqa: E731
+    return state.replace(info=kept(state.info), metrics=kept(state.metrics))
 
 
 def _tell(state: State, told: dict[str, Array]) -> State:
@@ -279,8 +290,11 @@ if not hasattr(jax, "device_put_replicated"):
 
 
 def _maker(name: str) -> Callable[..., BraxEnv]:
-    """Returns the function from settings to an environment that brax registers."""
-    return lambda **settings: BraxEnv(*registry.make(name, **settings))
+    """Returns the function from settings to an environment that brax registers.
+
+    brax's scripts name a physics backend, `backend`; there is none here, and it is ignored.
+    """
+    return lambda backend=None, **settings: BraxEnv(*registry.make(name, **settings))
 
 
 for _name in registry.ENVS:

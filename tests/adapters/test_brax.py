@@ -234,6 +234,31 @@ def test_a_shield_inside_the_training_wrappers_counts_by_episode():
     assert counted > 0
 
 
+def test_a_shield_around_the_training_wrappers_does_what_one_inside_does():
+    inside = brax.wrap(brax.ShieldWrapper(Counter(), threat_of, 0.1), 100)
+    around = brax.ShieldWrapper(brax.wrap(Counter(), 100), jax.vmap(threat_of), 0.1)
+    states = [jax.jit(env.reset)(raws(0)) for env in (inside, around)]
+    steps = [jax.jit(env.step) for env in (inside, around)]
+    for t in range(9):
+        states = [step(s, jnp.full(ROWS, t % 4)) for step, s in zip(steps, states, strict=True)]
+        for name in ("intervention", "insecure"):
+            np.testing.assert_array_equal(states[0].info[name], states[1].info[name])
+        same_bits(states[0].pipeline_state, states[1].pipeline_state)
+    assert set(states[1].metrics) >= {"intervention", "insecure"}
+
+
+@pytest.mark.parametrize("length", [0, -1, 2.5])
+def test_episodes_without_a_step_are_refused(length):
+    with pytest.raises(ValueError, match=rf"^episode_length is {length}; it must be an integer"):
+        brax.wrap(made("circuit"), length)
+
+
+def test_a_physics_backend_is_ignored():
+    env = brax.envs.get_environment("rp_jax_jam", backend="generalized", num_obstacles=3)
+    assert env.params.num_obstacles == 3
+    assert env.backend == "rp_jax"
+
+
 @pytest.mark.parametrize(
     "action", [jnp.zeros(3), jnp.zeros(()), jnp.asarray(True), jnp.zeros(2, int)]
 )

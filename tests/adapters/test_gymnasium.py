@@ -1,4 +1,7 @@
+import copy
 import functools
+import sys
+import warnings
 
 import gymnasium
 import jax
@@ -338,3 +341,235 @@ def test_threats_of_other_actions_than_there_are_are_refused():
         env.step(0)
     with pytest.raises(ValueError, match=r"^env: its actions are Box.*; they must be Discrete"):
         adapter.Shielded(gymnasium.make("Pendulum-v1"), lambda _: np.zeros(3), 0.1)
+
+
+@every_env
+def test_keywords_of_gymnasium_are_understood_and_the_limit_is_told(name):
+    default = {"circuit": 200, "jam": 100, "point_gather": 15}[name]
+    env = gymnasium.make(IDS[name], render_mode=None)
+    assert env.spec.max_episode_steps == default
+    assert gymnasium.spec(IDS[name]).max_episode_steps == default
+    assert env.render_mode is None
+    assert gymnasium.make(IDS[name], max_episode_steps=3).spec.max_episode_steps == 3
+    batch = gymnasium.make_vec(IDS[name], 2, max_episode_steps=3, render_mode=None)
+    assert batch.spec.max_episode_steps == 3
+    batch.reset(seed=0)
+    ends = [batch.step(np.full(2, 7))[3] for _ in range(6)]
+    np.testing.assert_array_equal(np.stack(ends)[:, 0], [False, False, True] * 2)
+    again = gymnasium.make_vec(batch.spec)
+    assert again.num_envs == 2
+    assert again.spec.max_episode_steps == 3
+
+
+def test_a_limit_longer_than_the_default_one_counts_and_of_two_the_shorter():
+    env = gymnasium.make(IDS["point_gather"], max_episode_steps=20)
+    env.reset(seed=0)
+    ends = [env.step(40)[3] for _ in range(20)]
+    assert ends == [False] * 19 + [True]
+    assert gymnasium.make_vec(IDS["circuit"], 1, time_limit=5).spec.max_episode_steps == 5
+    with pytest.raises(
+        ValueError, match=r"^max_episode_steps is 0; it must be an integer, above 0"
+    ):
+        gymnasium.make_vec(IDS["circuit"], 1, max_episode_steps=0)
+    with pytest.raises(ValueError, match=r"^render_mode is 'human'; it must be None"):
+        adapter.JaxEnv("circuit", render_mode="human")
+
+
+def test_a_list_of_seeds_gives_each_row_its_own_start():
+    env = make_vec("jam", 3)
+    first, _ = env.reset(seed=[1, 2, 3])
+    later = [env.step(np.full(3, 7))[0] for _ in range(3)]
+    other, _ = env.reset(seed=(3, 2, 9))
+    np.testing.assert_array_equal(other[:2], first[[2, 1]])
+    assert (other[2] != first[0]).any()
+    same_bits(env.reset(seed=np.asarray([1, 2, 3]))[0], first)
+    same_bits([env.step(np.full(3, 7))[0] for _ in range(3)], later)
+    fresh, _ = env.reset(seed=[1, None, 3])
+    np.testing.assert_array_equal(fresh[[0, 2]], first[[0, 2]])
+    assert (fresh[1] != first[1]).any()
+
+
+@pytest.mark.parametrize(
+    ("seed", "message"),
+    [
+        ([1, 2], "^seed has 2 entries; there must be one for each of 3"),
+        ([1, 2, -1], "^seed is -1; it must be an integer, at least 0"),
+        ([1, 2, 0.5], r"^seed is 0\.5; it must be an integer"),
+    ],
+)
+def test_lists_of_seeds_that_do_not_fit_are_refused(seed, message):
+    with pytest.raises(ValueError, match=message):
+        make_vec("circuit", 3).reset(seed=seed)
+
+
+def test_a_mask_resets_the_marked_rows_alone():
+    env = make_vec("jam", 3)
+    env.reset(seed=0)
+    before = env.step(np.full(3, 7))[0]
+    mask = np.asarray([False, True, False])
+    after, _ = env.reset(seed=1, options={"reset_mask": mask})
+    np.testing.assert_array_equal(after[~mask], before[~mask])
+    assert (after[mask] != before[mask]).any()
+    np.testing.assert_array_equal(env.states.time, [1, 0, 1])
+
+
+@pytest.mark.parametrize(
+    "mask", [np.ones(2, bool), np.ones(3, int), np.zeros(3, bool), [True, True, 1.0]]
+)
+def test_masks_that_do_not_fit_are_refused(mask):
+    env = make_vec("circuit", 3)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"^options: reset_mask is .*; it must be bool of shape"):
+        env.reset(options={"reset_mask": mask})
+
+
+def test_a_mask_before_there_are_states_is_refused():
+    with pytest.raises(gymnasium.error.ResetNeeded, match="reset_mask is given before the first"):
+        make_vec("circuit", 2).reset(options={"reset_mask": np.ones(2, bool)})
+
+
+@every_env
+def test_a_copy_steps_alike_and_apart(name):
+    env = make(name)
+    first, _ = env.reset(seed=0)
+    twin = copy.deepcopy(env)
+    moves = actions(name, 5)[:, 0]
+    one = [env.step(action)[:4] for action in moves]
+    two = [twin.step(action)[:4] for action in moves]
+    same_bits(one, two)
+    same_bits(env.reset(seed=0)[0], first)
+    batch = make_vec(name, 2)
+    batch.reset(seed=0)
+    other = copy.deepcopy(batch)
+    same_bits(batch.step(np.full(2, 7))[0], other.step(np.full(2, 7))[0])
+
+
+def test_observations_stay_inside_their_space_however_long_an_episode_is():
+    env = gymnasium.make(IDS["point_gather"], max_episode_steps=1000)
+    env.reset(seed=0)
+    for _ in range(450):
+        seen, *_ = env.step(8)
+    assert np.abs(seen).max() > 100  # the angle, which is not wrapped
+    assert seen in env.observation_space
+
+
+def test_observations_and_rewards_are_of_single_precision_in_double_precision():
+    with jax.enable_x64(True):
+        for name in registry.ENVS:
+            check_env(make(name).unwrapped)
+            env = make_vec(name)
+            seen, _ = env.reset(seed=0)
+            assert seen in env.observation_space
+            for action in actions(name, 13):
+                seen, reward, *_, info = env.step(action)
+                assert seen.dtype == reward.dtype == np.float32
+                assert seen in env.observation_space
+            lasts = [last for last in info.get("final_obs", []) if last is not None]
+            assert all(last.dtype == np.float32 for last in lasts)
+
+
+@pytest.mark.filterwarnings("ignore:os.fork", "ignore::UserWarning")  # gymnasium tells errors so
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not fork")
+def test_workers_forked_after_jax_was_used_say_what_to_do():
+    env = gymnasium.make_vec(
+        IDS["circuit"], 2, vectorization_mode="async", vector_kwargs={"context": "fork"}
+    )
+    with pytest.raises(RuntimeError, match=r"^circuit: this process was forked .* 'spawn'"):
+        env.reset(seed=0)
+    env.close(terminate=True)
+
+
+@pytest.mark.slow
+def test_workers_that_are_spawned_step():
+    env = gymnasium.make_vec(
+        IDS["circuit"], 2, vectorization_mode="async", vector_kwargs={"context": "spawn"}
+    )
+    first, _ = env.reset(seed=0)
+    assert first.shape == (2, 364)
+    env.step(np.full(2, 7))
+    env.close()
+
+
+def guarded_cart(threat=lambda _: np.asarray([0.0, 0.9]), x=0.1):
+    return adapter.Shielded(gymnasium.make("CartPole-v1"), threat, x)
+
+
+def test_a_shield_needs_a_reset_before_it_asks_for_threats():
+    with pytest.raises(gymnasium.error.ResetNeeded, match="step is called before reset"):
+        guarded_cart(lambda state: 1 / 0).step(0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"x": np.nan}, "^x is nan; it must be a number"),
+        ({"x": "0.1"}, "^x is '0.1'; it must be a number"),
+        ({"x": None}, "^x is None; it must be a number"),
+        ({"threat": None}, "^threat is None; it must be a function"),
+    ],
+)
+def test_what_a_shield_is_made_of_is_checked_at_once(change, message):
+    with pytest.raises(ValueError, match=message):
+        guarded_cart(**change)
+
+
+@pytest.mark.parametrize("table", [np.zeros((3, 2)), np.zeros(3), np.zeros((0, 1)), [[np.nan]]])
+def test_a_table_that_does_not_fit_the_actions_is_refused(table):
+    with pytest.raises(ValueError, match=r"^table has shape .*; its rows must be finite actions"):
+        adapter.Shielded(gymnasium.make("Pendulum-v1"), lambda _: np.zeros(3), 0.1, table)
+
+
+@pytest.mark.parametrize(
+    ("threat", "x", "passes"),
+    [
+        (1.00000001e-3, 1e-3, False),  # equal to x in single precision
+        (1e-3, 1e-3, True),
+        (np.float32(1e-3), 1e-3, False),  # 1.00000005e-3
+        (1e-3, 1.00000001e-3, True),
+        (1e-60, 0.0, False),
+        (1e300, np.inf, True),
+    ],
+)
+def test_threats_are_compared_in_double_precision(threat, x, passes):
+    env = guarded_cart(lambda _: [threat, 0.0], x)
+    env.reset(seed=0)
+    assert env.step(0)[-1]["intervention"] is not passes
+
+
+def test_a_shield_can_be_made_again_from_its_specification_and_passes_the_checks():
+    env = guarded_cart()
+    again = gymnasium.make(env.spec)
+    again.reset(seed=0)
+    assert again.step(1)[-1]["intervention"]
+    assert gymnasium.make(again.spec).spec == env.spec
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*is different from the unwrapped version.*")
+        warnings.filterwarnings("ignore", message=".*A Box observation space m.* value is")
+        check_env(env, skip_render_check=True)  # which needs pygame
+    twin = copy.deepcopy(env)
+    twin.reset(seed=0)
+    assert twin.step(1)[-1]["intervention"]
+
+
+class FromOne(gymnasium.Env):
+    """Two actions, 1 and 2."""
+
+    action_space = gymnasium.spaces.Discrete(2, start=1)
+    observation_space = gymnasium.spaces.Discrete(1)
+
+    def reset(self, *, seed=None, options=None):
+        return 0, {}
+
+    def step(self, action):
+        self.taken = action
+        return 0, 0.0, False, False, {}
+
+
+def test_actions_that_do_not_begin_at_0_are_counted_from_their_first():
+    env = adapter.Shielded(FromOne(), lambda _: [0.0, 0.9], 0.1)
+    env.reset()
+    for wish, replaced in ((1, False), (2, True), (np.asarray([0.0, 1.0]), True)):
+        assert env.step(wish)[-1]["intervention"] == replaced
+        assert env.unwrapped.taken == 1
+    with pytest.raises(ValueError, match=r"^action is 0; it must be an integer, at least 1"):
+        env.step(0)
