@@ -278,7 +278,8 @@ def reset(key: Array, params: Params) -> State:
     """
     needed = jnp.ones(params.num_obstacles, bool)
     placed = _appear(key, params.start, needed, params, params.num_obstacles)
-    state = start_at(params.start, placed, params)
+    # A copy: callers may give a state's memory away, and the parameters' must stay.
+    state = start_at(jax.tree.map(jnp.copy, params.start), placed, params)
     count_key = jax.random.fold_in(key, COUNT)
     count = jax.random.randint(count_key, (), params.fewest, params.num_obstacles + 1)
     return state.replace(present=jnp.arange(params.num_obstacles) < count)

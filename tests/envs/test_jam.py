@@ -549,3 +549,12 @@ def test_there_are_fifteen_actions_of_three_accelerations_and_five_turns():
     np.testing.assert_allclose(params.body.actions.acceleration[::5], [-0.02, 0, 0.02])
     turns = angle_of(params.body.actions.rotation[:5])
     np.testing.assert_allclose(turns, [-0.3, -0.1, 0, 0.1, 0.3], atol=1e-6)
+
+
+def test_giving_a_state_away_leaves_the_parameters():
+    params = jam.make_params(8)
+    state = jam.reset(jax.random.key(0), params)
+    donating = jax.jit(jam.step, donate_argnums=1)
+    donating(jax.random.key(1), state, jnp.asarray(COAST), params)
+    assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(params))
+    jam.reset(jax.random.key(0), params)
