@@ -21,7 +21,7 @@ WIDEST = 5.0  # greatest half-width, room units
 LARGEST = 50.0  # side of the square that a track has to fit into, room units
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrackPlan:
     """The plan of a track: a centre line drawn from (0, 0) along +x, one piece after another.
 
@@ -36,6 +36,19 @@ class TrackPlan:
     angles: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (n,) headings, radians
     position: tuple[float, float] = (0.0, 0.0)  # where the next piece begins, room units
     angle: float = 0.0  # heading at `position`, radians
+
+    def _values(self) -> tuple:
+        """Returns what makes two plans equal; adding 0 turns -0 into 0."""
+        arrays = [(len(a), (np.asarray(a) + 0.0).tobytes()) for a in (self.points, self.angles)]
+        return (self.half_width, *arrays, self.position, self.angle)
+
+    def __eq__(self, other: object) -> bool:
+        """Returns whether two plans draw the same track, number for number."""
+        return isinstance(other, TrackPlan) and self._values() == other._values()
+
+    def __hash__(self) -> int:
+        """Returns the same number for equal plans."""
+        return hash(self._values())
 
     def _extend(self, points, angles, position, angle) -> "TrackPlan":
         return replace(

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
+from rp_jax.envs import tracks
 from rp_jax.envs.tracks import (
     PLANS,
     SPACING,
@@ -300,3 +301,15 @@ def test_close_turns_left_from_above():
 def test_degrees_that_are_not_finite_are_named(degrees):
     with pytest.raises(ValueError, match=f"^curve: degrees is {degrees}"):
         TrackPlan().curve(1, degrees)
+
+
+def test_plans_of_the_same_track_are_equal_and_have_one_hash():
+    plans = [plan() for plan in tracks.PLANS.values()]
+    for i, one in enumerate(plans):
+        again = list(tracks.PLANS.values())[i]()
+        assert one == again
+        assert hash(one) == hash(again)
+        assert all(one != other for k, other in enumerate(plans) if k != i)
+    assert plans[0].widened(0.25) == tracks.narrowed_plan()
+    assert plans[0] != "default"
+    assert {plans[0]: 1}[tracks.default_plan()] == 1
