@@ -4,68 +4,120 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from rp_jax import statistics
 
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
-from matplotlib.ticker import EngFormatter, MaxNLocator
-
 BLUE, RED, GREY = "#2b6cb0", "#c53030", "#718096"
+ENOUGH = 256  # episodes of an agent in a point of a learning curve, at least, or a tenth of all
+POOLED = f"a point: at least {ENOUGH} episodes of an agent, or a tenth of all"
+WORDS = {  # for names of fields
+    "rmse": "root mean square error of the threat",
+    "unsafe_called_safe": "share of unsafe pairs called safe",
+    "states": "labelled states",
+}
+
+
+def plain(name: str) -> str:
+    """Returns a name in plain words, as a title: without underscores, and with a capital.
+
+    Args:
+        name: such as jam: RP (x=0.01).
+    """
+    words = name.replace("_", " ")
+    return words[:1].upper() + words[1:]
+
+
+def pooled(history: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Returns learning curves with enough episodes in every point: chunks are put together.
+
+    Agents play many episodes side by side, and the short ones end first: a chunk in which few ended
+    tells of short episodes only.
+
+    Args:
+        history: of one method, one row per chunk and seed, as in metrics.jsonl.
+
+    Returns:
+        A row per point and seed with steps, episodes, return_mean and crashes; no row where no
+        episode of a seed ended.
+    """
+    seeds = sorted({row["seed"] for row in history})
+    total = sum(row["episodes"] for row in history)
+    enough = max(1, min(ENOUGH * len(seeds), total // 10))
+    points: list[list[Mapping[str, Any]]] = [[]]
+    for steps in sorted({row["steps"] for row in history}):
+        if sum(row["episodes"] for row in points[-1]) >= enough:
+            points.append([])
+        points[-1] += [row for row in history if row["steps"] == steps]
+    if len(points) > 1 and sum(row["episodes"] for row in points[-1]) < enough:
+        few = points.pop()
+        points[-1] += few
+    return [_together(point, seed) for point in points for seed in seeds if _ended(point, seed)]
+
+
+def _ended(point: Sequence[Mapping[str, Any]], seed: int) -> list[Mapping[str, Any]]:
+    """Returns a seed's rows of a point in which episodes ended."""
+    return [row for row in point if row["seed"] == seed and row["episodes"]]
+
+
+def _together(point: Sequence[Mapping[str, Any]], seed: int) -> dict[str, Any]:
+    """Returns one row for a seed's rows of a point."""
+    rows = _ended(point, seed)
+    counts = [row["episodes"] for row in rows]
+    return {
+        "seed": seed,
+        "steps": max(row["steps"] for row in point),
+        "episodes": sum(counts),
+        "return_mean": float(np.average([row["return_mean"] for row in rows], weights=counts)),
+        "crashes": sum(row["crashes"] for row in rows),
+    }
 
 
 def learning_curves(history: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
-    """Draws return, crash rate and insecure states against environment steps.
+    """Draws return, crash rate and the share of states without an admissible action, against steps.
 
-    An insecure state is one without an admissible action.
+    Points of returns and crash rates pool enough episodes (`pooled`).
 
     Args:
         history: one row per chunk and seed, as in metrics.jsonl.
         title: title of the figure.
         path: where to write the PNG.
     """
-    steps = sorted({row["steps"] for row in history})
-    of = {s: [row for row in history if row["steps"] == s] for s in steps}
-    figure, axes = plt.subplots(3, 1, figsize=(7, 7.5), sharex=True, layout="constrained")
-    seeds = sorted({row["seed"] for row in history})
-    for seed in seeds:
-        mine = [row for row in history if row["seed"] == seed and row["episodes"]]
-        axes[0].plot(
-            [r["steps"] for r in mine], [r["return_mean"] for r in mine], color=BLUE, alpha=0.25
-        )
-    means = [
-        (s, np.mean([r["return_mean"] for r in of[s] if r["episodes"]]))
-        for s in steps
-        if any(r["episodes"] for r in of[s])
-    ]
-    label = f"mean of {len(seeds)} seed(s)"
-    axes[0].plot([s for s, _ in means], [mean for _, mean in means], color=BLUE, label=label)
+    points, seeds = pooled(history), len({row["seed"] for row in history})
+    at = sorted({row["steps"] for row in points})
+    of = {s: [row for row in points if row["steps"] == s] for s in at}
+    figure = Figure(figsize=(7, 7.5), layout="constrained")
+    axes = figure.subplots(3, 1, sharex=True)
+    for seed in sorted({row["seed"] for row in points}) if seeds > 1 else ():
+        mine = [row for row in points if row["seed"] == seed]
+        returns = [row["return_mean"] for row in mine]
+        axes[0].plot([row["steps"] for row in mine], returns, color=BLUE, alpha=0.25)
+    label = f"mean of {seeds} agents" if seeds > 1 else "one agent"
+    means = [np.mean([row["return_mean"] for row in of[s]]) for s in at]
+    axes[0].plot(at, means, color=BLUE, marker=".", label=label)
     axes[0].set_ylabel("return while exploring\n(crash penalty included)")
-    axes[0].legend(loc="lower right")
-    rates, low, high = [], [], []
-    ended = [s for s in steps if sum(r["episodes"] for r in of[s])]
-    for s in ended:
-        k, n = (sum(r[name] for r in of[s]) for name in ("crashes", "episodes"))
-        bounds = statistics.clopper_pearson(k, n)
-        rates.append(k / n)
-        low.append(bounds[0])
-        high.append(bounds[1])
-    axes[1].plot(ended, rates, color=RED)
-    axes[1].fill_between(ended, low, high, color=RED, alpha=0.2, label="95 % Clopper-Pearson")
-    axes[1].set_ylabel("crashes per episode\nwhile exploring")
-    axes[1].set_ylim(bottom=0)
-    axes[1].legend(loc="upper right")
-    axes[2].plot(steps, [np.mean([r["insecure"] for r in of[s]]) for s in steps], color=GREY)
-    axes[2].set_ylabel("share of states with no\nadmissible action")
-    axes[2].set_ylim(bottom=0)
-    axes[2].set_xlabel("agent steps")
-    for axis in axes:
+    counts = [[sum(row[name] for row in of[s]) for name in ("crashes", "episodes")] for s in at]
+    bounds = [statistics.clopper_pearson(k, n) for k, n in counts]
+    low, high = 100 * np.asarray(bounds).reshape(-1, 2).T
+    axes[1].plot(at, [100 * k / n for k, n in counts], color=RED, marker=".")
+    axes[1].fill_between(at, low, high, color=RED, alpha=0.2, label="95 % interval, exact")
+    axes[1].set_ylabel("episodes with a crash\nwhile exploring, %")
+    chunks = sorted({row["steps"] for row in history})
+    shares = [[row["insecure"] for row in history if row["steps"] == s] for s in chunks]
+    axes[2].plot(chunks, [100 * np.mean(share) for share in shares], color=GREY)
+    axes[2].set_ylabel("states without an\nadmissible action, %")
+    axes[2].set_xlabel(f"agent steps ({POOLED})")
+    axes[2].xaxis.set_major_formatter(EngFormatter(sep=""))
+    for axis, corner in zip(axes, ("lower right", "upper right", None), strict=True):
         axis.grid(alpha=0.3)
-    figure.suptitle(title)
+        if corner:
+            axis.legend(loc=corner)
+    for axis in axes[1:]:
+        axis.set_ylim(bottom=0)
+    figure.suptitle(plain(title))
     figure.savefig(path, dpi=120)
-    plt.close(figure)
 
 
 def methods(
@@ -75,7 +127,8 @@ def methods(
 ) -> None:
     """Draws return and crash rate while learning, with a column per task and a line per method.
 
-    Lines are means over seeds, bands 90 % intervals of Student. For a single seed the band of the
+    Points pool enough episodes (`pooled`). Lines are means over seeds, bands 90 % intervals of
+    Student. For a single seed the band of the
     crash rate is the 90 % interval of Clopper and Pearson.
 
     Args:
@@ -86,25 +139,18 @@ def methods(
     """
     most = max(len({row["method"] for row in history}) for history in panels.values())
     below = 0.12 + 0.06 * (most // 2 + 2)  # height of the legend
-    figure, axes = plt.subplots(
-        3,
-        len(panels),
-        figsize=(max(7, 4.6 * len(panels)), 6.6),
-        height_ratios=(1, 1, below),
-        sharex="col",
-        layout="constrained",
-        squeeze=False,
-    )
+    figure = Figure(figsize=(max(7, 4.6 * len(panels)), 6.6), layout="constrained")
+    axes = figure.subplots(3, len(panels), height_ratios=(1, 1, below), sharex="col", squeeze=False)
     for column, (title, history) in zip(axes.T, panels.items(), strict=True):
         colours = {True: iter(OURS), False: iter(OTHERS)}
         for name in dict.fromkeys(row["method"] for row in history):
-            of = [row for row in history if row["method"] == name and row["episodes"]]
+            of = pooled([row for row in history if row["method"] == name])
             _line(column, of, next(colours[name.startswith("RP")], "black"), name)
         for row, dashes in zip((levels or {}).get(title, ()), ("--", ":", "-."), strict=False):
             style = {"color": "black", "linestyle": dashes, "linewidth": 1}
             column[0].axhline(row["return_mean"], label=row["method"], **style)
             column[1].axhline(100 * row["crash_rate"], **style)
-        column[0].set_title(title)
+        column[0].set_title(plain(title))
         _percent(column[1], "y")
         column[1].set_xlabel("agent steps")
         column[1].tick_params(labelbottom=True)
@@ -116,9 +162,9 @@ def methods(
         handles, labels = column[0].get_legend_handles_labels()
         column[2].legend(handles, labels, loc="upper center", fontsize=8, ncols=2)
     axes[0, 0].set_ylabel("return while exploring\n(crash penalty included)")
-    axes[1, 0].set_ylabel("episodes with a crash, %")
+    axes[1, 0].set_ylabel("episodes with a crash\nwhile exploring, %")
+    figure.supxlabel(POOLED, fontsize=9)
     figure.savefig(path, dpi=120)
-    plt.close(figure)
 
 
 OURS = (BLUE, "#63b3ed")
@@ -171,14 +217,9 @@ def scores(
     """
     variants = list(dict.fromkeys(row["variant"] for row in rows))
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    figure, axes = plt.subplots(
-        len(variants),
-        2,
-        figsize=(10, (0.9 + 0.27 * len(methods)) * len(variants)),
-        sharey=True,
-        layout="constrained",
-        squeeze=False,
-    )
+    size = (10, (0.9 + 0.27 * len(methods)) * len(variants))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(len(variants), 2, sharey=True, squeeze=False)
     for (left, right), variant in zip(axes, variants, strict=True):
         for row in rows:
             if row["variant"] != variant:
@@ -207,7 +248,6 @@ def scores(
         axes[0, 0].plot([], [], "D", color=RED, markersize=4, fillstyle="none", label="paper")
         axes[0, 0].legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.55, 1.0), ncols=2)
     figure.savefig(path, dpi=120)
-    plt.close(figure)
 
 
 def frontier(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -219,14 +259,8 @@ def frontier(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """
     variants = list(dict.fromkeys(row["variant"] for row in rows))
     planners = list(dict.fromkeys(row["planner"] for row in rows))
-    figure, axes = plt.subplots(
-        2,
-        len(variants),
-        figsize=(3.8 * len(variants), 6),
-        sharex=True,
-        layout="constrained",
-        squeeze=False,
-    )
+    figure = Figure(figsize=(3.8 * len(variants), 6), layout="constrained")
+    axes = figure.subplots(2, len(variants), sharex=True, squeeze=False)
     for j, variant in enumerate(variants):
         for colour, shift, planner in zip((BLUE, RED), (0.97, 1.03), planners, strict=False):
             of = [r for r in rows if r["variant"] == variant and r["planner"] == planner]
@@ -238,15 +272,14 @@ def frontier(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
             low, high = 100 * np.asarray([r["crash_ci95"] for r in of]).T
             axes[1, j].errorbar(x, rates, np.stack([rates - low, high - rates]), **style)
         axes[0, j].set_title(variant)
-        axes[1, j].set_xlabel("threshold x")
+        axes[1, j].set_xlabel("threshold x (largest admissible threat)")
         for axis in axes[:, j]:
             axis.set_xscale("log")
             axis.grid(alpha=0.3)
     axes[0, 0].set_ylabel("return (crash penalty included)")
     axes[1, 0].set_ylabel("episodes with a crash, %")
-    axes[0, 0].legend()
+    axes[0, 0].legend(title="planner")
     figure.savefig(path, dpi=120)
-    plt.close(figure)
 
 
 def before_crashes(crashes: Sequence[Sequence[Mapping[str, Any]]], path: Path) -> None:
@@ -258,7 +291,8 @@ def before_crashes(crashes: Sequence[Sequence[Mapping[str, Any]]], path: Path) -
             (that after the best action).
         path: where to write the PNG.
     """
-    figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained", sharey=True)
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    axes = figure.subplots(1, 3, sharey=True)
     shown = (
         ("threat", GREY, "least threat of any action, as the agent sees it"),
         ("risk", RED, "risk of its action"),
@@ -283,7 +317,6 @@ def before_crashes(crashes: Sequence[Sequence[Mapping[str, Any]]], path: Path) -
     axes[0].set_ylabel(f"probability of a crash (at least {floor:g})")
     axes[0].legend()
     figure.savefig(path, dpi=120)
-    plt.close(figure)
 
 
 def fit_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path) -> None:
@@ -296,21 +329,19 @@ def fit_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path) 
     curves = {kind: rows for kind, rows in curves.items() if rows}
     if not curves:
         return
-    figure, axes = plt.subplots(
-        1, len(curves), figsize=(4.5 * len(curves), 3.4), layout="constrained", squeeze=False
-    )
+    figure = Figure(figsize=(4.5 * len(curves), 3.4), layout="constrained")
+    axes = figure.subplots(1, len(curves), squeeze=False)
     for axis, (kind, rows) in zip(axes[0], curves.items(), strict=True):
         steps = [row["step"] for row in rows]
         axis.plot(steps, [row["loss"] for row in rows], color=BLUE, label="training")
         held = [row["validation_loss"] for row in rows]
         axis.plot(steps, held, color=RED, label="validation")
-        axis.set_title(f"threat of one {kind}")
+        axis.set_title(f"Threat of one {kind.replace('_', ' ')}")
         axis.set_xlabel("gradient steps")
         axis.set_ylabel("cross entropy")
         axis.legend()
         axis.grid(alpha=0.3)
     figure.savefig(path, dpi=120)
-    plt.close(figure)
 
 
 def comparison(
@@ -333,13 +364,9 @@ def comparison(
         path: where to write the PNG.
     """
     columns = list(dict.fromkeys(tuple(row[name] for name in panels) for row in rows))
-    figure, axes = plt.subplots(
-        len(vertical),
-        len(columns),
-        figsize=(3.6 * len(columns), 3.1 * len(vertical)),
-        layout="constrained",
-        squeeze=False,
-    )
+    size = (3.6 * len(columns), 3.1 * len(vertical))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(len(vertical), len(columns), squeeze=False)
     for i, quantity in enumerate(vertical):
         for j, column in enumerate(columns):
             axis = axes[i, j]
@@ -354,12 +381,11 @@ def comparison(
                 axis.plot([r[horizontal] for r in of], [r[quantity] for r in of], ".", color=colour)
             axis.set_xscale("log")
             axis.set_yscale("log" if all(r[quantity] > 0 for r in here) else "linear")
-            axis.set_xlabel(horizontal.replace("_", " "))
+            axis.set_xlabel(WORDS.get(horizontal, horizontal.replace("_", " ")))
             axis.grid(alpha=0.3, which="both")
             if i == 0:
-                axis.set_title(", ".join(column), fontsize=10)
+                axis.set_title(plain(", ".join(column)), fontsize=10)
             if j == 0:
-                axis.set_ylabel(quantity.replace("_", " "))
+                axis.set_ylabel(WORDS.get(quantity, quantity.replace("_", " ")))
                 axis.legend()
     figure.savefig(path, dpi=120)
-    plt.close(figure)

@@ -4,13 +4,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
 
 FLOOR = 1e-6  # smaller threats have the same colour
 COLOURS = ("#c05621", "#805ad5", "#2c7a7b", "#2b6cb0", "#1a202c")
@@ -30,12 +28,11 @@ def lake(
         path: where to write the PNG.
     """
     letters = np.asarray([[*row] for row in rows])
-    figure, axes = plt.subplots(
-        1, len(actions), figsize=(3.3 * len(actions), 3.9), layout="constrained"
-    )
-    colours = plt.get_cmap("inferno").with_extremes(bad="#4a5568")
+    figure = Figure(figsize=(3.3 * len(actions), 3.9), layout="constrained")
+    axes = figure.subplots(1, len(actions), squeeze=False)
+    colours = colormaps["inferno"].with_extremes(bad="#4a5568")
     norm = LogNorm(FLOOR, 1.0, clip=True)
-    for axis, name, values in zip(np.atleast_1d(axes), actions, threat, strict=True):
+    for axis, name, values in zip(axes[0], actions, threat, strict=True):
         shown = np.ma.array(np.maximum(values, FLOOR), mask=letters == "H")
         axis.imshow(shown, norm=norm, cmap=colours)
         for (row, column), letter in np.ndenumerate(letters):
@@ -46,14 +43,18 @@ def lake(
             elif values[row, column] <= 0:
                 axis.text(column, row, "0", color="#a0aec0", ha="center", va="center", size=7)
         axis.set_title(name)
+        axis.set_xlabel("column")
         axis.set_xticks(range(letters.shape[1]), range(1, letters.shape[1] + 1), size=7)
         axis.set_yticks(range(letters.shape[0]), range(1, letters.shape[0] + 1), size=7)
     figure.colorbar(
-        ScalarMappable(norm, colours), ax=axes, label="threat (0 where marked)", shrink=0.75
+        ScalarMappable(norm, colours),
+        ax=axes,
+        label="threat of the action (0 where marked)",
+        shrink=0.75,
     )
+    axes[0, 0].set_ylabel("row")
     figure.suptitle(title)
     figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 def budgets(
@@ -74,9 +75,8 @@ def budgets(
         rule: the threshold rule whose rows are drawn.
     """
     variants = list(dict.fromkeys(row["variant"] for row in rows))
-    figure, axes = plt.subplots(
-        2, len(variants), figsize=(4.2 * len(variants), 7), layout="constrained", squeeze=False
-    )
+    figure = Figure(figsize=(4.2 * len(variants), 7), layout="constrained")
+    axes = figure.subplots(2, len(variants), squeeze=False)
     for column, variant in enumerate(variants):
         above, below = axes[:, column]
         best = [row for row in optima if row["variant"] == variant]
@@ -99,11 +99,12 @@ def budgets(
         below.set_xlabel("bound c on the danger of an episode")
     axes[0, 0].set_ylabel("return (chance of the goal)")
     axes[1, 0].set_ylabel("danger of an episode")
-    axes[0, 0].legend(fontsize=8)
-    axes[1, 0].legend(fontsize=8)
-    figure.suptitle(f"Rule: {rule}. No mark: the baseline is not safe at this c")
+    for axis in axes[:, 0]:
+        axis.legend(fontsize=8)
+    figure.suptitle(
+        f"Threshold rule: {rule}. eta: baseline policies; no mark: it is not safe at this c"
+    )
     figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 def shares(
@@ -118,21 +119,19 @@ def shares(
         baseline: the baseline policy whose rows are drawn.
     """
     variants = list(dict.fromkeys(row["variant"] for row in rows))
-    figure, axes = plt.subplots(
-        1, len(variants), figsize=(4 * len(variants), 3.8), layout="constrained", sharey=True
-    )
-    for axis, variant in zip(np.atleast_1d(axes), variants, strict=True):
+    figure = Figure(figsize=(4 * len(variants), 3.8), layout="constrained")
+    axes = figure.subplots(1, len(variants), sharey=True, squeeze=False)[0]
+    for axis, variant in zip(axes, variants, strict=True):
         for i, rule in enumerate(rules):
             mine = _of(rows, variant, baseline, rule)
             earned = [_number(row["share"]) for row in mine]
             axis.plot([row["c"] for row in mine], earned, **_style(i, rule))
         axis.set_xscale("log")
         axis.set_title(variant)
-        axis.set_xlabel("bound c")
-    np.atleast_1d(axes)[0].set_ylabel("share of the exact optimum")
-    np.atleast_1d(axes)[-1].legend(fontsize=8, title="threshold rule")
+        axis.set_xlabel("bound c on the danger of an episode")
+    axes[0].set_ylabel("share of the exact optimum")
+    axes[-1].legend(fontsize=8, title="threshold rule")
     figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 def _of(

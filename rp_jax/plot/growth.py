@@ -4,11 +4,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 BLUE, RED = "#2b6cb0", "#c53030"
@@ -25,18 +23,16 @@ def growth(series: Sequence[Mapping[str, Any]], path: Path) -> None:
     """
     columns = min(2, len(series))
     rows = -(-len(series) // columns)
-    figure, axes = plt.subplots(
-        rows, columns, figsize=(4.8 * columns, 3.6 * rows), layout="constrained", squeeze=False
-    )
+    figure = Figure(figsize=(4.8 * columns, 3.6 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
     for axis in axes.flat[len(series) :]:
         axis.set_visible(False)
     for axis, one in zip(axes.flat, series, strict=False):
         _panel(axis, one)
     figure.savefig(path, dpi=120)
-    plt.close(figure)
 
 
-def _panel(axis: plt.Axes, one: Mapping[str, Any]) -> None:
+def _panel(axis: Axes, one: Mapping[str, Any]) -> None:
     """Draws one series."""
     sizes, seconds = (np.asarray(one[name], float) for name in ("sizes", "seconds"))
     ends = [np.asarray(one[name], float) for name in ("fastest", "slowest")]

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import matplotlib
 import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
+from rp_jax.plot.legend import explain
 
 FLOOR = 1e-4  # smaller threats have the same colour
 
@@ -21,6 +21,8 @@ class Panel(NamedTuple):
     title: str
     threat: np.ndarray  # (ny, nx) from the bottom left
     extent: tuple[float, float, float, float]  # left, right, bottom, top, room units
+    horizontal: str = "x, room units"  # what the axes show
+    vertical: str = "y, room units"
 
 
 def heat_maps(panels: Sequence[Panel], x: float, path: Path, decorate=None) -> None:
@@ -30,13 +32,12 @@ def heat_maps(panels: Sequence[Panel], x: float, path: Path, decorate=None) -> N
         panels: drawn side by side.
         x: the threshold.
         path: where to write the PNG.
-        decorate: called with (axis, index) to add to a panel.
+        decorate: called with (axis, index) to add to a panel; what has a label is explained below.
     """
     columns = min(3, len(panels))
     lines = -(-len(panels) // columns)
-    figure, axes = plt.subplots(
-        lines, columns, figsize=(4.6 * columns, 3.9 * lines), layout="constrained", squeeze=False
-    )
+    figure = Figure(figsize=(4.6 * columns, 4.2 * lines + 0.3), layout="constrained")
+    axes = figure.subplots(lines, columns, squeeze=False)
     for i, axis in enumerate(axes.flat):
         if i >= len(panels):
             axis.axis("off")
@@ -53,11 +54,17 @@ def heat_maps(panels: Sequence[Panel], x: float, path: Path, decorate=None) -> N
             axis.contour(
                 panel.threat, [x], extent=panel.extent, origin="lower", colors="cyan", linewidths=1
             )
+            axis.add_line(
+                Line2D(
+                    [], [], color="cyan", linewidth=1, label=f"threat equal to the threshold, {x:g}"
+                )
+            )
+        axis.set(xlabel=panel.horizontal, ylabel=panel.vertical)
         axis.set_title(panel.title, fontsize=10)
         axis.set_aspect("equal")
         if decorate is not None:
             decorate(axis, i)
     scale = ScalarMappable(LogNorm(FLOOR, 1.0, clip=True), "inferno")
-    figure.colorbar(scale, ax=axes, label=f"threat (cyan: x = {x:g})", shrink=0.8)
+    figure.colorbar(scale, ax=axes, label="threat of the least threatening action", shrink=0.8)
+    explain(figure)
     figure.savefig(path, dpi=120, bbox_inches="tight")
-    plt.close(figure)
