@@ -1,6 +1,7 @@
 """Comparison of one learner without a shield, penalised instead, and with a shield."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,50 @@ from rp_jax.runs.agents import Agents
 from rp_jax.runs.evaluate import evaluate
 from rp_jax.runs.plan import make_pmdp, plan
 from rp_jax.runs.progress import OnMetrics, OnProgress, silent
-from rp_jax.runs.tables import Table
+from rp_jax.runs.tables import Table, aligned, crashed, earned, over_seeds, percent
 from rp_jax.streams import Stream, key_of, numbered
 from rp_jax.threat.function import ThreatFunction
 from rp_jax.validate import number
+
+
+@dataclass(frozen=True)
+class ShieldTable(Table):
+    """Results of several methods, each summed up by itself; `print` shows what was hit."""
+
+    def __str__(self) -> str:
+        return aligned(
+            [
+                {
+                    "variant": row["variant"],
+                    "method": row["method"],
+                    "agent": str(row["seed"]),
+                    "return": earned(row),
+                    "crashes": crashed(row),
+                    "crash rate, % [95 %]": percent(row),
+                    "hit": hits(row["collisions"]),
+                    "goal": f"{row['goal_rate']:.3f}",
+                }
+                for row in self.rows
+            ]
+        )
+
+    @property
+    def summary(self) -> list[dict[str, Any]]:
+        """One row per method and variant, over the agents: see `over_seeds`."""
+        found = []
+        for method in dict.fromkeys(row["method"] for row in self.rows):
+            of = [row for row in self.rows if row["method"] == method]
+            found += [{"method": method, **row} for row in over_seeds(of)]
+        return found
+
+
+def hits(collisions: Mapping[str, int]) -> str:
+    """Returns in words what was hit, such as obstacle 12, wall 3; nothing is an empty text.
+
+    Args:
+        collisions: by kind, in how many episodes.
+    """
+    return ", ".join(f"{kind} {count:,}" for kind, count in collisions.items() if count)
 
 
 def compare_shields(
@@ -40,7 +81,7 @@ def compare_shields(
     devices: str = "one",
     on_progress: OnProgress = silent,
     on_metrics: OnMetrics = silent,
-) -> tuple[list[Agents], Table]:
+) -> tuple[list[Agents], ShieldTable]:
     """Compares acting at random and learning: without a shield, penalised, and with the shield.
 
     Args:
@@ -76,11 +117,17 @@ def compare_shields(
         "penalty": penalty,
         "settings": settings,
         "devices": devices,
-        "on_progress": on_progress,
         "on_metrics": on_metrics,
     }
+    bars = [_named(on_progress, name) for name in ("without shield", "with shield")]
     free = plan(
-        key, env, params, learning_penalty=(0.0, penalty), folder=place("unshielded"), **common
+        key,
+        env,
+        params,
+        learning_penalty=(0.0, penalty),
+        folder=place("unshielded"),
+        on_progress=bars[0],
+        **common,
     )
     held = plan(
         key,
@@ -91,6 +138,7 @@ def compare_shields(
         lookahead=lookahead,
         insecure_penalty=insecure_penalty,
         folder=folder,
+        on_progress=bars[1],
         **common,
     )
     rows: list[dict[str, Any]] = []
@@ -106,8 +154,11 @@ def compare_shields(
             penalty=penalty,
             episodes=episodes,
             name=name,
+            on_progress=_named(on_progress, "at random"),
         )
-        for agents, where in ((free, place("unshielded")), (held, folder)):
+        for agents, where, bar in zip(
+            (free, held), (place("unshielded"), folder), bars, strict=True
+        ):
             rows += evaluate(
                 key,
                 agents,
@@ -118,9 +169,14 @@ def compare_shields(
                 name=name,
                 folder=where,
                 devices=devices,
-                on_progress=on_progress,
+                on_progress=bar,
             )
-    return [free, held], Table(rows)
+    return [free, held], ShieldTable(rows)
+
+
+def _named(on_progress: OnProgress, name: str) -> OnProgress:
+    """Returns a callback that tells whose each stage is, so that each has a bar of its own."""
+    return lambda stage, *rest: on_progress(f"{stage}, {name}", *rest)
 
 
 def untrained(
@@ -135,6 +191,7 @@ def untrained(
     lookahead: int = 0,
     seed: int = 0,
     name: str = "",
+    on_progress: OnProgress = silent,
 ) -> list[dict[str, Any]]:
     """Evaluates acting at random: over all actions alike, and over all admissible actions alike.
 
@@ -149,6 +206,7 @@ def untrained(
         lookahead: of the shield, as in `plan`.
         seed: number of the episodes, as of an agent.
         name: of the parameters, for the table.
+        on_progress: called with (stage, done, total, note).
 
     Returns:
         Two rows of facts.
@@ -160,11 +218,15 @@ def untrained(
 
     own = numbered(key_of(key, Stream.UNTRAINED), [seed])[0]
     play = jax.jit(lambda pmdp: evaluation.play_episodes(own, pmdp, policy, episodes))
-    rows = []
-    for method, given in {"random": None, f"random, shield (x={x:g})": threat}.items():
+    rows: list[dict[str, Any]] = []
+    stage = f"evaluation {name}".strip()
+    cases = {"random": None, f"random, shield (x={x:g})": threat}
+    for method, given in cases.items():
+        on_progress(stage, len(rows), len(cases), method)
         found = play(make_pmdp(env, params, given, x=x, lookahead=lookahead))
         evaluation.check(found, method)
         shown = {"variant": name, "method": method, "seed": seed}
         shown["x"] = float("inf") if given is None else x
         rows.append({**shown, **evaluation.summarise(found, penalty)})
+    on_progress(stage, len(cases), len(cases), "")
     return rows
