@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.figures import jam_figures, point_gather_figures
+from experiments.figures import circuit_figures, jam_figures, point_gather_figures
 from rp_jax.dynamics import Vehicle
 from rp_jax.envs import circuit, jam, patrol, point_gather
 from rp_jax.plot import scenes
@@ -40,15 +40,18 @@ def draw_all(folder: Path) -> list[Path]:
     """
     key = jax.random.key(SEED)
     track, room, field = circuit.make_params(), jam.make_params(), point_gather.make_params()
-    walls = jam.wall_points()
-    corners = scenes.Scene(walls, [(0.0, 0.0), (0.0, jam.ROOM), (jam.ROOM, 0.0)], jam.ZONE)
+    corners = jam_figures.scene_of(room)
     targets = [(np.asarray([c]), patrol.NEAR, scenes.GOOD) for c in patrol.CORNERS]
     circle, square = circuit.demo_start(track), jam.reset(key, room)
     wide = point_gather.reset(key, field)
     found: dict[str, tuple[scenes.Scene, Any, Callable[[Any], Vehicle] | None]] = {
-        "circuit": (scenes.Scene(np.asarray(track.track.walls)), circle, None),
+        "circuit": (circuit_figures.scene_of(track.track), circle, None),
         "jam": (corners, square, jam_figures.present_obstacles),
-        "patrol": (corners._replace(rings=targets), square, jam_figures.present_obstacles),
+        "patrol": (
+            corners._replace(rings=targets, exit=None, goal=None),
+            square,
+            jam_figures.present_obstacles,
+        ),
         "point_gather": (
             point_gather_figures.scene_of(wide)._replace(radius=0.35),
             wide,

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from experiments.figures import shared
+from experiments.figures import shared, words
 from rp_jax.dynamics import Vehicle
 from rp_jax.envs import jam
 from rp_jax.plot import maps, scenes
@@ -14,11 +14,8 @@ from rp_jax.streams import Stream
 
 def draw(run: RunResult, bar: OnProgress) -> None:
     """All figures of a run, and an animation."""
-    folder = shared.figures_of(run)
-    corners = [(0.0, 0.0), (0.0, jam.ROOM), (jam.ROOM, 0.0)]
-    scene = scenes.Scene(
-        jam.wall_points(), corners, jam.ZONE, str(run.world.settings.get("fidelity")) == "paper"
-    )
+    folder, quarters = shared.figures_of(run), run.world.settings.get("fidelity") == "paper"
+    scene = scene_of(run.agents.pmdp.params, quarters)
     bar("figures", 0, 2, "trajectories")
     panels = []
     for variant, test in ((name, run.world.params(name)) for name in run.world.tests):
@@ -26,7 +23,7 @@ def draw(run: RunResult, bar: OnProgress) -> None:
         starts = jax.vmap(jam.reset, (0, None))(keys, test)
         limit = int(test.time_limit)
         episodes = shared.play(run, test, starts, limit, present_obstacles)
-        panels.append((variant, scene, episodes))
+        panels.append((words.variant(variant).capitalize(), scene, episodes))
         if variant == f"N={run.world.settings['num_obstacles']}" or len(panels) == 1:
             shown = episodes
     scenes.trajectories(panels, folder / "trajectories.png")
@@ -39,6 +36,19 @@ def draw(run: RunResult, bar: OnProgress) -> None:
     shared.animation(run, scene, longest, bar)
 
 
+def scene_of(params: jam.Params, round_zones: bool = False) -> scenes.Scene:
+    """The room with its safety zones, its exit, and the point that progress is measured to."""
+    room = float(params.room)
+    return scenes.Scene(
+        jam.wall_points(room),
+        [(0.0, 0.0), (0.0, room), (room, 0.0)],
+        jam.ZONE,
+        round_zones,
+        exit=np.asarray([[room - jam.EXIT, room], [room, room]]),
+        goal=params.goal.tolist(),
+    )
+
+
 def present_obstacles(states: jam.State) -> Vehicle:
     """The obstacles, those that have disappeared at nan, which is not drawn."""
     shown = states.present[..., None]
@@ -49,9 +59,10 @@ def present_obstacles(states: jam.State) -> Vehicle:
 def draw_maps(run: RunResult) -> None:
     """Figure 4: single-obstacle threats, and their sums for two velocities."""
     cases = [(0.0, 0.06, 0.1), (np.pi, 0.06, 0.1), (np.pi / 2, 0.06, 0.0)]
+    ways = ("ahead, like the agent,", "the opposite way", "to the agent's left")
     titles = [
-        f"obstacle heading {np.degrees(h):.0f} deg at {v:g}, agent at {own:g}"
-        for h, v, own in cases
+        f"Obstacle driving {way} at {v:g},\nagent at {own:g} room units / step"
+        for way, (_, v, own) in zip(ways, cases, strict=True)
     ]
 
     def features(places: np.ndarray, i: int) -> np.ndarray:
@@ -65,8 +76,8 @@ def draw_maps(run: RunResult) -> None:
     key = shared.key_of_figures(run, Stream.STARTS)
     state = jam.reset(key, run.agents.pmdp.params)
     velocities = {
-        "heading 45 deg, speed 0.1": (np.pi / 4, 0.1),
-        "heading 180 deg, speed 0.05": (np.pi, 0.05),
+        "Agent heading 45 degrees left of x\nat 0.1 room units / step": (np.pi / 4, 0.1),
+        "Agent heading against x\nat 0.05 room units / step": (np.pi, 0.05),
     }
     sums = shared.threat_of_all(run, state, (0.0, 3.0, 0.0, 3.0), velocities)
     others = jax.tree.map(np.asarray, state.obstacles)
@@ -75,7 +86,9 @@ def draw_maps(run: RunResult) -> None:
         axis.quiver(
             *others.position.T, *(others.heading * others.speed[:, None]).T, color="#63b3ed"
         )
-        axis.plot(*others.position.T, "o", color="#63b3ed", markersize=4)
-        axis.plot(*jam.wall_points().T, ",", color="white")
+        label = "obstacle, and its velocity"
+        axis.plot(*others.position.T, "o", color="#63b3ed", markersize=4, label=label)
+        wall = {"marker": ".", "linestyle": "none", "markersize": 2, "clip_on": False}
+        axis.plot(*jam.wall_points().T, **wall, color="#38a169", label="wall")
 
     maps.heat_maps(sums, run.config.x, shared.figures_of(run) / "threat_of_all.png", decorate)

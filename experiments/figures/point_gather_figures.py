@@ -22,7 +22,7 @@ def draw(run: RunResult, bar: OnProgress) -> None:
     starts = jax.vmap(point_gather.reset, (0, None))(keys, params)
     episodes = shared.play(run, params, starts, int(params.time_limit), objects_left)
     rooms = [scene_of(jax.tree.map(lambda a, i=i: a[i], starts)) for i in range(ROOMS)]
-    panels = [(f"room {i}", rooms[i], [episodes[i]]) for i in range(ROOMS)]
+    panels = [(f"Room {i + 1}", rooms[i], [episodes[i]]) for i in range(ROOMS)]
     scenes.trajectories(panels, folder / "trajectories.png")
     if run.threat is not None:
         bar("figures", 1, 2, "threat maps")
@@ -46,6 +46,7 @@ def scene_of(state: point_gather.State):
             (apples, point_gather.REACH, scenes.GOOD),
             (bombs, point_gather.REACH, scenes.BAD),
         ],
+        names={scenes.GOOD: "apple, and its reach", scenes.BAD: "bomb, and its reach"},
     )
 
 
@@ -61,7 +62,8 @@ def objects_left(states: point_gather.State) -> Vehicle:
 def draw_maps(run: RunResult) -> None:
     """The threat of one bomb in the middle of the room and before a wall, and of all bombs."""
     centres = [(0.0, 0.0), (-5.0, 0.0), (5.0, 0.0)]  # of the room, as the agent sees it
-    titles = ["in the middle", "a wall ahead", "a wall behind"]
+    places = ("in the middle of the room", "before a wall", "with its back to a wall")
+    titles = [f"Agent {place}" for place in places]
 
     def features(places: np.ndarray, i: int) -> np.ndarray:
         return np.concatenate([places, np.tile([*centres[i], 1.0, 0.0], (len(places), 1))], axis=-1)
@@ -71,16 +73,17 @@ def draw_maps(run: RunResult) -> None:
     def outline(axis, i: int) -> None:
         corners = np.asarray([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
         axis.autoscale(False)
-        axis.plot(*(centres[i] + point_gather.ROOM * corners).T, "w")
+        axis.plot(*(centres[i] + point_gather.ROOM * corners).T, color="#38a169", label="wall")
 
     maps.heat_maps(panels, run.config.x, shared.figures_of(run) / "threat_of_one_bomb.png", outline)
     key = shared.key_of_figures(run, Stream.STARTS)
     state = point_gather.reset(key, run.agents.pmdp.params)
     box = (-point_gather.ROOM, point_gather.ROOM) * 2
-    velocities = {"heading 0 deg": (0.0, 0.0), "heading 90 deg": (np.pi / 2, 0.0)}
+    velocities = {"Agent heading along x": (0.0, 0.0), "Agent heading along y": (np.pi / 2, 0.0)}
     sums = shared.threat_of_all(run, state, box, velocities)
 
     def decorate(axis, i: int) -> None:
-        axis.plot(*np.asarray(state.bombs.position).T, "o", color=scenes.BAD, markersize=4)
+        bombs = np.asarray(state.bombs.position)
+        axis.plot(*bombs.T, "o", color=scenes.BAD, markersize=4, label="bomb")
 
     maps.heat_maps(sums, run.config.x, shared.figures_of(run) / "threat_of_all.png", decorate)

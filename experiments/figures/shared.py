@@ -118,7 +118,8 @@ def threat_of_one(
         features = jnp.asarray(make(grid.reshape(-1, 2), i), jnp.float32)
         threat = np.asarray(predict(model, features)).min(axis=-1)
         extent = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
-        panels.append(maps.Panel(title, threat.reshape(grid.shape[:2]), extent))
+        labels = (f"{kind} ahead of the agent, room units", f"{kind} to its left, room units")
+        panels.append(maps.Panel(title, threat.reshape(grid.shape[:2]), extent, *labels))
     return panels
 
 
@@ -154,7 +155,8 @@ def threat_of_all(
                 np.asarray(row(run.agents[0].pmdp, states.replace(body=bodies)))[: len(chunk)]
             )
         threat = np.concatenate(parts).reshape(len(ys), len(xs))
-        panels.append(maps.Panel(title, threat, box))
+        labels = ("x of the agent, room units", "y of the agent, room units")
+        panels.append(maps.Panel(title, threat, box, *labels))
     return panels
 
 
@@ -165,7 +167,7 @@ def wall_maps(run: RunResult, speeds: Sequence[float]) -> None:
     panels = threat_of_one(
         run,
         "wall",
-        [f"wall point, agent at {speed:g}" for speed in speeds],
+        [f"One wall point, agent at {speed:g} room units / step" for speed in speeds],
         lambda places, i: np.concatenate([places, np.full((len(places), 1), speeds[i])], axis=-1),
     )
     maps.heat_maps(panels, run.config.x, figures_of(run) / "threat_of_one_wall_point.png")
@@ -184,7 +186,9 @@ def animation(
         run.config.x,
         run.folder / "animation.gif",
         lambda done, total: bar("animation", done, total, ""),
-        "acceleration" if run.agents.pmdp.params.body.delayed else "step forward",
+        "acceleration, room units / step$^2$"
+        if run.agents.pmdp.params.body.delayed
+        else "step forward, room units",
     )
 
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from experiments.figures import words
 from experiments.paper import published, scores
 from experiments.paper.section import Section, Table
 
@@ -27,7 +28,7 @@ def tell(results: dict[str, Any]) -> Section:
     tables, lines, minutes = [], [], 0.0
     for env, of in results.items():
         rows = [row for row in of["rows"] if row["variant"] in published.SCORES[env]]
-        tables.append(scores.table(env, scores.summed_up(rows), published.SCORES[env]))
+        tables.append(scores.table(words.TASKS[env], scores.summed_up(rows), published.SCORES[env]))
         took = {part: of["seconds"][part] / 60 for part in PARTS}
         minutes += sum(took.values())
         line = {"task": env, "seeds": len({row["seed"] for row in rows})}

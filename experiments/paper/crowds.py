@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from experiments.figures import words
 from experiments.paper import scores
 from experiments.paper.section import Section
 
@@ -21,7 +22,7 @@ def plot(results: list[dict[str, Any]], folder: Path) -> None:
     """Return and crash rate."""
     from rp_jax.plot import curves
 
-    curves.scores(scores.summed_up(results), {}, folder / "scores.png")
+    curves.scores(words.told(scores.summed_up(results)), {}, folder / "scores.png")
 
 
 def tell(results: list[dict[str, Any]]) -> Section:

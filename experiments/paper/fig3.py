@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments import frozen_lake
+from experiments.figures import words
 from experiments.paper.scores import read
 from experiments.paper.section import Claim, Section, Table, holds
 
@@ -21,7 +22,7 @@ def run(sources: Any, folder: Path) -> dict[str, Any]:
 
 def plot(results: dict[str, Any], folder: Path) -> None:
     """Figures 3a and 3b, and what each threshold rule earns of the optimum."""
-    frozen_lake.plot_rules(results, folder)
+    frozen_lake.plot_rules({name: words.told(rows) for name, rows in results.items()}, folder)
 
 
 def tell(results: dict[str, Any]) -> Section:

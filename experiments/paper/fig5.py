@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.figures import words
 from experiments.paper import published, scores
 from experiments.paper.section import Claim, Section, Table, holds
 from rp_jax import statistics
@@ -43,8 +44,8 @@ def plot(results: dict[str, Any], folder: Path) -> None:
     """A column per task."""
     from rp_jax.plot import curves
 
-    panels = {env: of["history"] for env, of in results.items()}
-    levels = {env: of["levels"] for env, of in results.items()}
+    panels = {words.TASKS[env]: of["history"] for env, of in results.items()}
+    levels = {words.TASKS[env]: words.told(of["levels"]) for env, of in results.items()}
     curves.methods(panels, folder / "figure_5.png", levels)
 
 
@@ -58,15 +59,17 @@ def tell(results: dict[str, Any]) -> Section:
     rising = [row for env, of in results.items() for row in rise(env, of)]
     claims = [claim for env in ("circuit", "jam") for claim in _ahead(results[env], env)]
     return Section(
-        f"{len(seeds)} seed(s); lines are means over seeds, bands 90 % intervals. Curves show the "
-        "agents as they explore; the table, the learned agents. MPC does not learn.",
+        f"{words.counted(len(seeds), 'seed')}; lines are means over seeds, bands 90 % intervals. "
+        "Curves show the agents as they explore; the table, the learned agents. MPC does not "
+        "learn.",
         tables=[
             Table("After learning, on the task that was learned", learned),
             Table("Whether returns still rise", rising),
         ],
         claims=[*claims, *_gather(results["point_gather"])],
         figures={
-            "figure_5.png": "Return and crash rate against agent steps.",
+            "figure_5.png": "Return and crash rate against agent steps; where few episodes ended, "
+            "which are short ones, they are shown together with the next.",
             "trajectories.png": "Point Gather, x = .5: six rooms; apples green, bombs red.",
             "animation.gif": "Point Gather, x = .5: an episode, and the threat of each action.",
         },

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import rp_jax
+from experiments.figures import words
 from experiments.paper.scores import read
 from experiments.paper.section import Claim, Section, holds
 from rp_jax import evaluation
@@ -66,16 +67,17 @@ def _played(pmdp: Any, policy: Any, weights: Any) -> list[dict[str, Any]]:
 
 def plot(results: list[dict[str, Any]], folder: Path) -> None:
     """A line per track, a column per method."""
+    from experiments.figures import circuit_figures
     from rp_jax.plot import scenes
 
     panels = []
     for row in results:
-        scene = scenes.Scene(np.asarray(circuit.make_params(row["track"]).track.walls))
+        scene = circuit_figures.scene_of(circuit.make_params(row["track"]).track)
         episodes = [
             scenes.Path2D(np.asarray(e["position"]), np.asarray(e["hit"], bool))
             for e in row["episodes"]
         ]
-        panels.append((f"{row['method']}, {row['track']}", scene, episodes))
+        panels.append((f"{row['method']}, {words.variant(row['track'])}", scene, episodes))
     scenes.trajectories(panels, folder / "figure_6.png")
 
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from experiments.figures import words
 from experiments.paper import published, scores
 from experiments.paper.section import Section, Table
 
@@ -30,7 +31,7 @@ def plot(results: dict[str, Any], folder: Path) -> None:
     """Learning curves of both."""
     from rp_jax.plot import curves
 
-    panels = {env: of["history"] for env, of in results.items()}
+    panels = {words.TASKS[env]: of["history"] for env, of in results.items()}
     curves.methods(panels, folder / "learning.png")
 
 
@@ -39,7 +40,7 @@ def tell(results: dict[str, Any]) -> Section:
     tables, claims, lasted, threats = [], [], [], []
     for env, of in results.items():
         found = scores.summed_up(of["rows"])
-        tables.append(scores.table(env, found, published.SCORES[env]))
+        tables.append(scores.table(words.TASKS[env], found, published.SCORES[env]))
         for row in of["reports"]:
             threats.append({"task": env, "recipe": row["method"], **scores.errors(row)})
         theirs = [row for row in found if row["method"] == PAPER]

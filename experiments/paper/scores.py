@@ -8,6 +8,7 @@ from typing import Any
 
 from scipy import stats
 
+from experiments.figures import words
 from experiments.paper import published
 from experiments.paper.section import Claim, Section, Table, holds, verdict_on
 from rp_jax.runs import tables
@@ -116,7 +117,7 @@ def line(env: str, row: Row) -> Row:
     """A line of a table: what a method's agents do on a task after learning."""
     return {
         "task": env,
-        "method": row["method"],
+        "method": words.method(row["method"]),
         "seeds": row["seeds"],
         "return": tables.earned(row),
         "crashes": tables.crashed(row),
@@ -190,7 +191,8 @@ def plot(rows: Sequence[Row], env: str, path: Path) -> None:
     """All methods' returns and crash rates, with the published ones."""
     from rp_jax.plot import curves
 
-    curves.scores(summed_up(rows), published.SCORES[env], path)
+    paper = {words.variant(name): of for name, of in published.SCORES[env].items()}
+    curves.scores(words.told(summed_up(rows)), paper, path)
 
 
 def tell(rows: Sequence[Row], env: str, where: str) -> Section:

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from experiments.figures import words
 from experiments.paper import published, scores
 from experiments.paper.section import Claim, Section, holds
 from rp_jax.runs import tables
@@ -25,8 +26,8 @@ def plot(results: dict[str, Any], folder: Path) -> None:
     """Return and crash rate while learning, and after it."""
     from rp_jax.plot import curves
 
-    curves.methods({"patrol among 8 obstacles": results["history"]}, folder / "learning.png")
-    curves.scores(scores.summed_up(results["rows"]), {}, folder / "scores.png")
+    curves.methods({"Patrol among 8 obstacles": results["history"]}, folder / "learning.png")
+    curves.scores(words.told(scores.summed_up(results["rows"])), {}, folder / "scores.png")
 
 
 def tell(results: dict[str, Any]) -> Section:

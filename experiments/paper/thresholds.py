@@ -5,6 +5,7 @@ from typing import Any
 
 from scipy import stats
 
+from experiments.figures import words
 from experiments.paper.scores import read
 from experiments.paper.section import Claim, Section, Table, holds
 from rp_jax.runs import tables
@@ -22,7 +23,7 @@ def plot(results: list[dict[str, Any]], folder: Path) -> None:
     """Return and crash rate over x."""
     from rp_jax.plot import curves
 
-    curves.frontier(results, folder / "frontier.png")
+    curves.frontier(words.told(results), folder / "frontier.png")
 
 
 def tell(results: list[dict[str, Any]]) -> Section:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.figures import words
 from experiments.paper import published
 from experiments.paper.published import LEARNED_ON
 from experiments.paper.scores import AHEAD, PLANS, RP, SEARCHES, read
@@ -137,7 +138,7 @@ def tell(results: dict[str, Any]) -> Section:
         lines.append(
             {
                 "task": env,
-                "method": method,
+                "method": words.method(method),
                 "seconds": f"{seconds:.4f}",
                 "paper": "" if paper is None else f"{paper:g}",
                 "released code, two cores": "" if again is None else f"{again:g}",
@@ -196,12 +197,13 @@ def _learning(row: dict[str, Any]) -> tuple[dict[str, Any], list[Claim]]:
         "planning of all seeds, minutes": f"{planning:.1f}",
     }
     most, hours = published.THREAT_MINUTES, published.TRAINING_HOURS
+    seeds = words.counted(row["seeds"], "seed")
     as_many = planning / 60 * STEPS / row["steps"]
     claims = [
         Claim(
             f"Appendix G.1, {row['env']}: hours to plan, {STEPS / 1e6:g}M steps",
             f"{hours:g}, on a GPU",
-            f"{as_many:.2f} for as many steps of {row['seeds']} seed(s) side by side, on a CPU "
+            f"{as_many:.2f} for as many steps of {seeds} side by side, on a CPU "
             f"({row['steps']:,} were made)",
             EXCEEDED if as_many < hours else MISSED,
         ),

@@ -14,6 +14,7 @@ from tiny import programs_of_a_moment  # noqa: F401
 from experiments import all as everything
 from experiments import compare
 from experiments.paper import (
+    ablations,
     brief,
     commands,
     fig5,
@@ -125,6 +126,34 @@ def test_the_curves_claims_look_at_every_chunk(sources, tmp_path):
         assert level[claim].verdict == section.REPRODUCED
     safer = claims["Section 5.3, jam: safer than 3-step MPC"]
     assert safer.verdict == section.MISSED  # level
+
+
+def test_the_ablations_say_what_was_hit_with_each_switch(sources, tmp_path):
+    results = made("ablations", sources, tmp_path / "ablations")
+    rows = ablations.tell(results).tables[0].rows
+    found = {(row["method"], row["variant"]): row["what was hit"] for row in rows}
+    assert found["as in table 1", "N=3"] == ""
+    assert found["obstacles: horizon 5", "N=8"] == "wall 8"
+    old = [{**row, "causes": {"wall": 1, "obstacle": 2}} for row in results]
+    for row in old:
+        del row["collisions"]
+    assert ablations.tell(old).tables[0].rows[0]["what was hit"] == "wall 2, obstacle 4"
+
+
+def test_figure_5_is_told_in_plain_words(sources, tmp_path, monkeypatch):
+    from rp_jax.plot import curves
+
+    drawn = []
+    monkeypatch.setattr(curves, "methods", lambda *given: drawn.append(given))
+    results = made("fig5", sources, tmp_path / "fig5")
+    fig5.plot(results, tmp_path / "fig5")
+    ((panels, _, levels),) = drawn
+    assert list(panels) == ["Point Gather", "Circuit", "Jam"]
+    shown = [row["method"] for row in levels["Point Gather"]]
+    assert list(dict.fromkeys(shown)) == ["MPC (1 step)", "MPC (2 steps)"]
+    told = fig5.tell(results)
+    assert told.text.startswith("2 seeds; ")
+    assert "MPC (1 steps)" not in {row["method"] for row in told.tables[0].rows}
 
 
 def test_wider_is_said_only_where_the_ranks_say_it():
