@@ -524,8 +524,8 @@ MUTANTS = [
         "tests/adapters/test_gymnasium.py",
         (
             "the shield lets the wish pass",
-            "chosen = self._correct(jnp.asarray(threat), jnp.asarray(wish))",
-            "chosen = self._correct(0 * jnp.asarray(threat), jnp.asarray(wish))",
+            "chosen = _correct(threat, wish, self._x, self._table)",
+            "chosen = _correct(0 * threat, wish, self._x, self._table)",
         ),
     ),
 ]
