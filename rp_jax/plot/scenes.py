@@ -207,7 +207,7 @@ def animate(
         rows: name and unit of the quantity in the rows.
     """
     frames = len(episode.action)
-    figure = Figure(figsize=(9, 5), layout="constrained")
+    figure = Figure(figsize=(9, 5.2), layout="constrained")
     world, table = figure.subplots(1, 2, width_ratios=(1.25, 1))
     in_world, show_world = _world(world, scene, episode)
     in_table, show_table = _table(table, episode, (accelerations, turns), x)
@@ -317,7 +317,8 @@ def _pictures(
     """
     figure.set_dpi(80)
     canvas: Any = FigureCanvasAgg(figure)
-    canvas.draw()
+    for _ in range(2):  # the first layout does not know yet how high the legend is
+        canvas.draw()
     figure.set_layout_engine("none")
     for artist in moving:
         artist.set_animated(True)

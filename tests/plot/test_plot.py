@@ -368,7 +368,9 @@ def test_the_legend_of_an_animation_covers_nothing(obstacles, animated):
     for t in (0, 4, 8):
         show(t)
         for axis in figure.axes:
-            assert legend.y1 <= axis.get_tightbbox().y0
+            around = axis.get_tightbbox()
+            assert legend.y1 <= around.y0
+            assert around.y1 <= figure.bbox.y1
 
 
 def test_the_greatest_acceleration_is_at_the_top_and_left_turns_are_on_the_left(animated):
