@@ -112,7 +112,9 @@ def threats(sizes: Sequence[int] = OBSTACLES) -> Series:
         states = states.replace(body=states.body.replace(position=middle))
         program = lambda pmdp, states: pmdp.perceive(states)  # noqa: E731
         pieces = [Piece(program, (now, states)), *more_chunks(now, states)]
-        rows.append(measure("jam", "states", BATCH, BATCH, program, now, states, repeats=20, pieces=pieces))
+        rows.append(
+            measure("jam", "states", BATCH, BATCH, program, now, states, repeats=20, pieces=pieces)
+        )
     title = f"Jam at equal density, {BATCH} states"
     return series(title, "obstacles", "look and threats of all", sizes, rows, 1)
 

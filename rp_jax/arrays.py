@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-
 SHORT = 32  # longest list that is ranked by counting
 
 
