@@ -108,7 +108,7 @@ class Batch(NamedTuple):
 
 
 class ActorCriticMetrics(NamedTuple):
-    """Sums over a batch, to be divided by `episodes` or `steps`."""
+    """Sums over a batch, to be divided by `episodes` or `steps`; counts are int32."""
 
     steps: Array  # () number of steps
     episodes: Array  # () number of episodes that ended
@@ -291,13 +291,12 @@ def collect(
         step = _Step(encoded, elapsed, action, signal, value, next_value, outcome.done)
         running, ended = tally.tally(running, outcome)
         earned = config.gamma * earned + reward
-        dtype = ended.score.dtype
         bad_observation, bad_signal = non_finite(encoded, signal)
         metrics = ActorCriticMetrics(
-            steps=jnp.asarray(config.num_envs, dtype),
+            steps=jnp.asarray(config.num_envs, jnp.int32),
             **ended._asdict(),
-            bad_observations=jnp.sum(bad_observation, dtype=dtype),
-            bad_rewards=jnp.sum(bad_signal, dtype=dtype),
+            bad_observations=tally.count(bad_observation),
+            bad_rewards=tally.count(bad_signal),
         )
         ahead = jnp.where(outcome.done, 0.0, earned)
         return (*carried, running, ahead), (step, metrics, jnp.sum(jnp.square(earned)))
@@ -305,7 +304,7 @@ def collect(
     begin = (state.states, look(state.states), state.running, state.earned)
     keys = jax.random.split(key, config.length)
     (states, _, running, earned), (steps, metrics, squares) = jax.lax.scan(one, begin, keys)
-    metrics = jax.tree.map(lambda m: jnp.sum(m, axis=0), metrics)
+    metrics = jax.tree.map(lambda m: jnp.sum(m, axis=0, dtype=m.dtype), metrics)
     before = state.spread
     spread = Spread(before.squares + jnp.sum(squares), before.steps + config.steps)
     now = Recent(metrics.danger, metrics.episodes, metrics.steps)

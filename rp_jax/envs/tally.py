@@ -17,13 +17,22 @@ class Running(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """Sums over the episodes that ended in a step, () each."""
+    """Sums over the episodes that ended in a step, () each; counts are int32."""
 
     episodes: Array  # number of episodes
     score: Array  # their reward, without any penalty for danger
     danger: Array  # their danger
     crashes: Array  # number of episodes with any danger
     goals: Array  # number of episodes that reached the goal
+
+
+def count(flags: Array) -> Array:
+    """Returns how many flags are set, () int32: a float32 counts to 16.8 million only.
+
+    Args:
+        flags: bool, of any shape.
+    """
+    return jnp.sum(flags, dtype=jnp.int32)
 
 
 def tally(running: Running, outcome: Outcome) -> tuple[Running, Ended]:
@@ -37,12 +46,11 @@ def tally(running: Running, outcome: Outcome) -> tuple[Running, Ended]:
         The sums to continue with, and the sums over the episodes that ended in this step.
     """
     total = Running(running.score + outcome.reward, running.danger + outcome.danger)
-    dtype = total.score.dtype
     ended = Ended(
-        episodes=jnp.sum(outcome.done, dtype=dtype),
+        episodes=count(outcome.done),
         score=jnp.sum(jnp.where(outcome.done, total.score, 0.0)),
         danger=jnp.sum(jnp.where(outcome.done, total.danger, 0.0)),
-        crashes=jnp.sum(outcome.done & (total.danger > 0), dtype=dtype),
-        goals=jnp.sum(outcome.goal, dtype=dtype),
+        crashes=count(outcome.done & (total.danger > 0)),
+        goals=count(outcome.goal),
     )
     return jax.tree.map(lambda a: jnp.where(outcome.done, 0.0, a), total), ended

@@ -105,7 +105,10 @@ class LoopConfig:
 
 
 class LoopMetrics(NamedTuple):
-    """Sums over a chunk of iterations, to be divided by `episodes` or `steps`."""
+    """Sums over a chunk of iterations, to be divided by `episodes` or `steps`.
+
+    Counts are int32, exact up to `validate.MOST`; score, danger and loss are floats.
+    """
 
     steps: Array
     episodes: Array
@@ -234,19 +237,18 @@ def interact(
         next_admissible=seen.admissible,
     )
     running, ended = tally.tally(state.running, outcome)
-    dtype = ended.score.dtype
     bad_observation, bad_threat = non_finite(state.seen.encoded, state.seen.threat)
     metrics = LoopMetrics(
-        steps=jnp.asarray(batch, dtype),
+        steps=jnp.asarray(batch, jnp.int32),
         **ended._asdict(),
-        insecure=jnp.sum(~state.seen.secure, dtype=dtype),
-        inadmissible=jnp.sum(_inadmissible(state.seen, action), dtype=dtype),
-        loss=jnp.zeros((), dtype),
-        bad_observations=jnp.sum(bad_observation, dtype=dtype),
-        bad_threats=jnp.sum(bad_threat, dtype=dtype),
-        bad_rewards=jnp.sum(~jnp.isfinite(taken.reward), dtype=dtype),
+        insecure=tally.count(~state.seen.secure),
+        inadmissible=tally.count(_inadmissible(state.seen, action)),
+        loss=jnp.zeros((), ended.score.dtype),
+        bad_observations=tally.count(bad_observation),
+        bad_threats=tally.count(bad_threat),
+        bad_rewards=tally.count(~jnp.isfinite(taken.reward)),
     )
-    metrics = jax.tree.map(lambda count: jnp.where(starting, 0.0, count), metrics)
+    metrics = jax.tree.map(lambda a: jnp.where(starting, jnp.zeros_like(a), a), metrics)
     window = jax.tree.map(
         lambda old, new: jnp.concatenate([old[1:], new[None]]), state.window, taken
     )
@@ -411,7 +413,7 @@ def chunk(
         number("iterations", iterations, least=1, integer=True)
     updates = config.updates if updates is None else updates
 
-    def iteration(_, carry: tuple[LoopState, LoopMetrics]) -> tuple[LoopState, LoopMetrics]:
+    def iteration(_, carry: tuple[LoopState, Sums]) -> tuple[LoopState, Sums]:
         state, sums = carry
         state, metrics = collect(state, pmdp, config)
         keys = jax.random.split(state.key, 1 + config.updates)
@@ -422,10 +424,46 @@ def chunk(
 
         start = state._replace(key=keys[0]), metrics.loss
         state, loss = jax.lax.fori_loop(0, updates, update, start)
-        return state, jax.tree.map(jnp.add, sums, metrics._replace(loss=loss))
+        return state, sums_with(sums, metrics._replace(loss=loss))
 
-    nothing = LoopMetrics(*[jnp.zeros((), state.running.score.dtype)] * len(LoopMetrics._fields))
-    return jax.lax.fori_loop(0, iterations, iteration, (state, nothing))
+    nothing = no_metrics(state.running.score.dtype)
+    start = Sums(nothing, jax.tree.map(jnp.zeros_like, nothing))
+    state, sums = jax.lax.fori_loop(0, iterations, iteration, (state, start))
+    return state, jax.tree.map(jnp.add, sums.total, sums.lost)
+
+
+class Sums(NamedTuple):
+    """Sums over many iterations, whose floats do not drift: what rounding lost is kept beside."""
+
+    total: LoopMetrics
+    lost: LoopMetrics  # 0 for counts, which lose nothing
+
+
+def no_metrics(dtype: Any) -> LoopMetrics:
+    """Returns the metrics of no iteration.
+
+    Args:
+        dtype: of the sums that are no counts.
+    """
+    floats = ("score", "danger", "loss")
+    of = lambda name: jnp.zeros((), dtype if name in floats else jnp.int32)  # noqa: E731
+    return LoopMetrics(*map(of, LoopMetrics._fields))
+
+
+def sums_with(sums: Sums, metrics: LoopMetrics) -> Sums:
+    """Returns sums with those of one more iteration (compensated summation, Kahan 1965).
+
+    A float32 above 1.3e9 moves in steps of 128: without what is kept beside, the returns of the few
+    episodes that end in an iteration would be rounded to that.
+
+    Args:
+        sums: so far.
+        metrics: of the iteration.
+    """
+    new = jax.tree.map(jnp.add, metrics, sums.lost)
+    total = jax.tree.map(jnp.add, sums.total, new)
+    lost = jax.tree.map(lambda new, after, before: new - (after - before), new, total, sums.total)
+    return Sums(total, lost)
 
 
 def check(params: Any, metrics: LoopMetrics) -> None:

@@ -225,7 +225,7 @@ def _learned(
             return state, metrics.rollout._asdict() | _update_facts(metrics)
 
         state, metrics = jax.lax.scan(one, state, None, length=length)
-        return state, jax.tree.map(lambda m: jnp.sum(m, axis=0), metrics)
+        return state, jax.tree.map(lambda m: jnp.sum(m, axis=0, dtype=m.dtype), metrics)
 
     def more(sums: Mapping[str, float]) -> dict[str, Any]:
         counted = actor_critic.ActorCriticMetrics._fields

@@ -102,11 +102,11 @@ def history(learners: Learners, tape: Tape, done: int) -> list[dict[str, Any]]:
         done: how many chunks there were.
     """
     rows = []
-    steps = np.cumsum(tape.metrics["steps"].astype(int), axis=0)
+    steps = np.cumsum(tape.metrics["steps"], axis=0, dtype=np.int64)
     for chunk in range(done):
         for i, member in enumerate(learners.members):
-            of = {name: float(m[chunk, i]) for name, m in tape.metrics.items()}
-            ended = max(of["episodes"], 1.0)
+            of = {name: m[chunk, i].item() for name, m in tape.metrics.items()}
+            ended = max(of["episodes"], 1)
             rows.append(
                 {
                     "seed": member.seed,

@@ -124,6 +124,8 @@ def test_a_batch_holds_what_happened(limit):
     rounds = 10 // (last + 1)
     assert metrics.steps == 80
     assert metrics.episodes == 8 * rounds
+    for name in ("steps", "episodes", "crashes", "goals"):
+        assert getattr(metrics, name).dtype == np.int32, name
     assert metrics.score == 8 * rounds * 2 * sum(range(last + 1))
     assert metrics.danger == pytest.approx(8 * sum(np.arange(10) % (last + 1)) / 10, rel=1e-5)
     np.testing.assert_array_equal(after.states.time, np.full(8, 10 % (last + 1)))

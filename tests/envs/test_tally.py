@@ -17,3 +17,9 @@ def test_a_tally_sums_what_ended_and_begins_anew():
     running, ended = tally.tally(running, step)
     np.testing.assert_array_equal(running, [[0, 0, 0, 44], [0, 0, 0, 1]])
     assert ended == (3, 11 + 22 + 33, 1 + 2, 2, 1)
+    counts = (ended.episodes, ended.crashes, ended.goals)
+    assert {count.dtype for count in counts} == {np.dtype("int32")}
+
+
+def test_counts_are_whole_numbers_in_double_precision_too(x64):
+    assert tally.count(jnp.asarray([True, False, True])).dtype == jnp.int32

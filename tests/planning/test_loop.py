@@ -170,6 +170,47 @@ def test_two_chunks_are_one_of_twice_the_length():
     assert alike(both._replace(loss=sums.loss), sums)  # sums of losses are rounded
 
 
+COUNTS = ("steps", "episodes", "crashes", "goals", "insecure", "inadmissible")
+MANY = 1_999_000_000  # which float32 rounds to multiples of 128
+
+
+def test_counts_are_exact_up_to_two_billion(monkeypatch, compile_soon):
+    """A chunk that begins where a long one would be: what it adds is what it made."""
+    pmdp = probe.make_pmdp(probe, PARAMS, x=1e-3)
+    config = dataclasses.replace(CONFIG, num_envs=31, steps=31 * 40, replay=31 * 40)
+    state, _ = start(jax.random.key(0), pmdp, config)
+    alone = loop.chunk(state, pmdp, config, 30)[1]
+    blank = loop.no_metrics
+
+    def begun(dtype):
+        return blank(dtype)._replace(**{name: jnp.asarray(MANY, jnp.int32) for name in COUNTS})
+
+    monkeypatch.setattr(loop, "no_metrics", begun)
+    late = loop.chunk(state, pmdp, config, 30)[1]
+    assert alone.steps == 30 * 31
+    assert alone.episodes > 0
+    for name in COUNTS:
+        assert getattr(late, name) == MANY + getattr(alone, name), name
+
+
+def test_sums_of_a_long_chunk_do_not_drift():
+    """80,000 iterations of 255 environments; added one by one, the returns come to 32,124,160."""
+    blank = loop.no_metrics(jnp.float32)
+    once = blank._replace(
+        steps=jnp.asarray(255, jnp.int32), score=jnp.asarray(401.65), loss=jnp.asarray(0.1)
+    )
+
+    @jax.jit
+    def long(once):
+        step = lambda _, sums: loop.sums_with(sums, once)  # noqa: E731
+        return jax.lax.fori_loop(0, 80_000, step, loop.Sums(blank, blank)).total
+
+    total = long(once)
+    assert total.steps == 20_400_000
+    assert total.score == pytest.approx(80_000 * 401.65, rel=1e-7)
+    assert total.loss == pytest.approx(8_000, rel=1e-7)
+
+
 def test_seeds_side_by_side_learn_what_each_learns_alone(compile_soon):
     pmdp, _, _ = learned("RP")
     begun = [start(jax.random.key(k), pmdp, CONFIG)[0] for k in (1, 5)]

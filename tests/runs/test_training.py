@@ -54,6 +54,18 @@ def test_each_chunk_and_member_has_a_row(tmp_path):
     assert np.isnan(rows[0]["return_mean"])
 
 
+def test_counts_are_told_as_they_are():
+    """Where single precision would round them, over chunks that add up to 2e9."""
+    chunk = {"steps": 999_999_999, "episodes": 33_333_333, "crashes": 16_777_217, "goals": 5}
+    metrics = {name: np.full((2, 2), count, np.int32) for name, count in chunk.items()}
+    metrics |= {name: np.zeros((2, 2), np.float32) for name in ("score", "danger")}
+    tape = training.Tape(metrics, np.zeros(2, np.float32))
+    rows = training.history(training.Learners(MEMBERS, ["a", "b"], 0.0, None), tape, 2)
+    assert [row["steps"] for row in rows] == 2 * [999_999_999] + 2 * [1_999_999_998]
+    assert {(row["episodes"], row["crashes"]) for row in rows} == {(33_333_333, 16_777_217)}
+    assert all(type(row[name]) is int for row in rows for name in ("steps", "episodes", "crashes"))
+
+
 def test_progress_and_rows_are_told_as_they_come():
     said, rows = [], []
     learn(None, on_progress=lambda *of: said.append(of), on_metrics=rows.append, stage="counting")
