@@ -384,6 +384,11 @@ class JaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
+        """Keeps what gymnasium made the batch from.
+
+        Args:
+            spec: as `gymnasium.make_vec` sets it.
+        """
         self._spec = spec
 
     def reset(

@@ -26,13 +26,25 @@ from rp_jax.envs.contract import FUNCTIONS
 
 CHECKPOINTS = "checkpoints"  # folder inside that of a job, until it is finished
 LOCK = "lock"  # held by the process that is at work on a job
-FLAGS = (  # they change draws or last bits
-    "XLA_FLAGS",
-    "JAX_DEFAULT_MATMUL_PRECISION",
-    "JAX_ENABLE_X64",
-    "JAX_THREEFRY_PARTITIONABLE",
+CONFIG = (  # values of jax.config that change draws or last bits, however they were set
+    "jax_default_device",
+    "jax_default_matmul_precision",
+    "jax_default_prng_impl",
+    "jax_disable_jit",
+    "jax_disable_most_optimizations",
+    "jax_enable_x64",
+    "jax_exec_time_optimization_effort",
+    "jax_explicit_x64_dtypes",
+    "jax_high_dynamic_range_gumbel",
+    "jax_numpy_dtype_promotion",
+    "jax_optimization_level",
+    "jax_random_seed_offset",
+    "jax_softmax_custom_jvp",
+    "jax_threefry_partitionable",
 )
-LIBRARIES = ("rp_jax", "jax", "jaxlib", "flax", "optax", "flashbax", "numpy")
+VARIABLES = ("XLA_FLAGS", "LIBTPU_INIT_ARGS", "NVIDIA_TF32_OVERRIDE")  # read outside jax.config
+LIBRARIES = ("rp_jax", "jax", "jaxlib", "flax", "optax", "flashbax", "numpy", "scipy")
+SHOWN_BY = ("matplotlib", "rich", "tyro")  # packages in which nothing is computed
 OUTSIDE = ("cli", "plot")  # folders of the library in which nothing is computed
 
 
@@ -43,18 +55,62 @@ def machine(env: Any) -> dict[str, Any]:
         env: the environment, or the module of a script; its source counts as well, where it is
             not the library's.
     """
+    device = jax.devices()[0]
     return {
-        "versions": {name: _version(name) for name in LIBRARIES},
-        "device": str(jax.devices()[0]),
-        "flags": {name: os.environ.get(name, "") for name in FLAGS},
+        "versions": versions_of(env),
+        "device": f"{device} ({device.device_kind})",
+        "flags": flags(),
         "code": code_of(env),
     }
 
 
-def _version(library: str) -> str:
-    if library == "rp_jax":
-        return rp_jax.__version__
-    return importlib.metadata.version(library)
+def flags() -> dict[str, str]:
+    """Returns the settings of this process that change numbers: of jax.config, and variables.
+
+    The values are those in force, whether they were set by an environment variable, by
+    `jax.config.update` or by a context manager; "" stands for a setting that there is not.
+    """
+    known = jax.config.values
+    of = lambda name: getattr(jax.config, name, known.get(name, ""))  # noqa: E731
+    variables = {name: os.environ.get(name, "") for name in VARIABLES}
+    return {name: str(of(name)) for name in CONFIG} | variables
+
+
+def versions_of(env: Any) -> dict[str, str]:
+    """Returns the versions of what computes a job: this library's, and the world's own packages.
+
+    Args:
+        env: the environment, or the module of a script.
+
+    Returns:
+        By name of the package, as it is installed.
+    """
+    names = {*LIBRARIES[1:], *_packages_of(env)}
+    return {"rp_jax": rp_jax.__version__} | {
+        name: importlib.metadata.version(name) for name in sorted(names)
+    }
+
+
+def _packages_of(env: Any) -> set[str]:
+    """Returns the installed packages, beside the usual ones, that the files of a world import.
+
+    The adapters that the world is built on count as its own files: they import brax.
+    """
+    own = sources_of(env)
+    imported = {name for file in own.values() for name in _imports_of(file, "")}
+    adapters = Path(rp_jax.__file__).parent / "adapters"
+    for file in adapters.glob("*.py"):
+        if f"rp_jax.adapters.{file.stem}" in imported:
+            imported |= _imports_of(file, "rp_jax.adapters")
+    tops = {name.partition(".")[0] for name in imported} - {name.partition(".")[0] for name in own}
+    foreign = tops - sys.stdlib_module_names - {"rp_jax", *SHOWN_BY, *LIBRARIES}
+    return {package for top in foreign for package in _distributions().get(top, ())}
+
+
+@functools.cache
+def _distributions() -> Mapping[str, list[str]]:
+    """Returns the installed packages by the name that each is imported by."""
+    return importlib.metadata.packages_distributions()
 
 
 def name_of(env: Any) -> str:
@@ -168,18 +224,7 @@ def _own_imports(name: str, file: Path) -> dict[str, Path]:
     package = whole if file.name == "__init__.py" else whole.rpartition(".")[0]
     depth = len(package.split(".")) if package else 0
     root = file.parents[depth]  # the folder that the package, or the module, is in
-    try:
-        tree = ast.parse(file.read_bytes())
-    except SyntaxError as error:
-        raise ValueError(f"{file} cannot be parsed ({error})") from error
-    names = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            base = "." * node.level + (node.module or "")
-            base = importlib.util.resolve_name(base, package) if node.level else base
-            names |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
+    names = _imports_of(file, package)
     if package:
         names = {name for name in names if name.partition(".")[0] == package.partition(".")[0]}
     parts = [name.split(".") for name in names]
@@ -191,6 +236,28 @@ def _own_imports(name: str, file: Path) -> dict[str, Path]:
             if candidate.is_file():
                 found[other] = candidate
     return found
+
+
+def _imports_of(file: Path, package: str) -> set[str]:
+    """Returns the names that a file imports, in full; also of functions and classes.
+
+    Args:
+        file: of a module.
+        package: that it is in; "" leaves relative imports out.
+    """
+    try:
+        tree = ast.parse(file.read_bytes())
+    except SyntaxError as error:
+        raise ValueError(f"{file} cannot be parsed ({error})") from error
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and (package or not node.level):
+            base = "." * node.level + (node.module or "")
+            base = importlib.util.resolve_name(base, package) if node.level else base
+            names |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
+    return names
 
 
 def digest_of(tree: Any) -> str:
