@@ -423,8 +423,8 @@ class JaxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             super().reset(seed=None)
             given = [one for one in seeds if one is not None]
             if len(given) == len(seeds):
-                entropy = np.random.SeedSequence(given).generate_state(1)[0]
-                self._np_random, self._np_random_seed = seeding.np_random(int(entropy))
+                # Tuples of integers have the same hash everywhere.
+                self._np_random, self._np_random_seed = seeding.np_random(abs(hash(tuple(given))))
             drawn = self.np_random.integers(2**31, size=self.num_envs)
             chosen = [d if one is None else one for one, d in zip(seeds, drawn, strict=True)]
             keys = np.asarray(chosen, np.uint32)
