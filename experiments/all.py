@@ -10,8 +10,6 @@ python -m experiments.all --preset quick
 
 import gc
 import os
-import signal
-import sys
 import traceback
 from collections import Counter
 from collections.abc import Sequence
@@ -210,18 +208,30 @@ def ledger(folder: Path) -> list[dict[str, Any]]:
     return lines
 
 
+class Terminated(BaseException):
+    """There was a SIGTERM: raised wherever the process is, so that it ends its child too."""
+
+
+def _terminate(*_: Any) -> None:
+    raise Terminated
+
+
 def main(argv: Sequence[str] | None = None) -> Path:
-    """Runs the command; exits with 1 if a result failed, 2 on bad input, 130 on Ctrl-C."""
+    """Runs the command; exits with 1 if a result failed, 2 on bad input.
+
+    It exits with 130 on Ctrl-C, and with 143 on SIGTERM, which ends the running process too.
+    """
     config = tyro.cli(Config, prog=NAME, description=__doc__, args=argv)
     with errors.bad_input():
         preset, folder = begun(config)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # ends the running process too
     sources = Sources(folder / "runs", preset)
     try:
-        failed = make(config.only or tuple(RESULTS), sources, folder)
-    except KeyboardInterrupt:
+        with errors.on_sigterm(_terminate):
+            failed = make(config.only or tuple(RESULTS), sources, folder)
+    except (KeyboardInterrupt, Terminated) as stop:
         terminal.say(f"to go on: {NAME} --resume {folder}", style="yellow")
-        raise SystemExit(130) from None
+        code = errors.TERMINATED if isinstance(stop, Terminated) else 130
+        raise SystemExit(code) from None
     report.write(folder, blocks(folder, preset, failed))
     terminal.say(f"results: {folder / 'report.html'}")
     for name, why in failed.items():

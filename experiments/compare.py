@@ -299,6 +299,7 @@ COMMAND = Command(
     prepare=prepared,
     title=lambda config: f"compare-{config.env}",
     job=job,
+    keep=lambda run, folder: train.keep_threat(run.world, run.process.threat, folder),
 )
 
 if __name__ == "__main__":

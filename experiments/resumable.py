@@ -1,6 +1,7 @@
 """Command lines with settings of their own whose runs go on after an interruption."""
 
 import dataclasses
+import functools
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -13,6 +14,7 @@ from rp_jax import storage
 from rp_jax.cli import errors, experiment, terminal
 from rp_jax.runs import record
 from rp_jax.runs.dataclass_json import restored
+from rp_jax.runs.train import with_own_threat
 
 
 class Command(NamedTuple):
@@ -25,6 +27,7 @@ class Command(NamedTuple):
     title: Callable[[Any], str]  # of the default folder, from the settings
     job: Callable[[Any, Any, Path], None]  # (settings, ready, folder)
     facts: Callable[[Any], dict[str, Any]] = lambda ready: {}  # more for config.json, from `ready`
+    keep: Callable[[Any, Path], None] = lambda ready, folder: None  # copies what a resume needs
 
 
 def main(command: Command, argv: Sequence[str]) -> Path:
@@ -43,6 +46,8 @@ def main(command: Command, argv: Sequence[str]) -> Path:
         if folder is not None:
             plain = experiment.interrupted(folder, command.name, module, argv)
             settings: Any = restored(command.settings, plain, str(folder / "config.json"))
+            if hasattr(settings, "threat"):
+                settings = with_own_threat(settings, folder)
             ready = command.prepare(settings)
         else:
             settings = tyro.cli(
@@ -52,7 +57,8 @@ def main(command: Command, argv: Sequence[str]) -> Path:
             out = settings.out or experiment.default_out(command.title(settings))
             folder = storage.new_folder(out)
             facts = {"experiment": command.name, **dataclasses.asdict(settings)}
-            experiment.begin(folder, {**facts, **command.facts(ready), **record.machine(module)})
+            facts |= {**command.facts(ready), **record.machine(module)}
+            experiment.begin(folder, facts, functools.partial(command.keep, ready, folder))
     again, checkpoints = f"{command.name} --resume {folder}", folder / record.CHECKPOINTS
     with errors.resumable(again, folder, lambda: shutil.rmtree(checkpoints)):
         command.job(settings, ready, folder)

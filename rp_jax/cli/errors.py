@@ -12,6 +12,8 @@ from rp_jax.cli.terminal import say
 from rp_jax.runs import record
 from rp_jax.runs.train import can_draw
 
+TERMINATED = 128 + 15  # exit code that shells give a process which SIGTERM has ended
+
 
 @contextmanager
 def bad_input() -> Iterator[None]:
@@ -28,9 +30,10 @@ def bad_input() -> Iterator[None]:
 
 @contextmanager
 def resumable(again: str, folder: Path, finish: Callable[[], None]) -> Iterator[None]:
-    """Surrounds a run: says how to go on if it is stopped, and exits with 130 or, on errors, 1.
+    """Surrounds a run: says how to go on if it is stopped, and exits with what says why.
 
-    Exits with 2 if another process is at work on the run. SIGTERM ends it as Ctrl-C does.
+    That is 130 after Ctrl-C and 143 after SIGTERM, which ends the run as Ctrl-C does; 1 after an
+    error; and 2 if another process is at work on the run.
 
     Args:
         again: the command that goes on.
@@ -40,36 +43,57 @@ def resumable(again: str, folder: Path, finish: Callable[[], None]) -> Iterator[
     with ExitStack() as stack:
         with bad_input():
             stack.enter_context(storage.locked(folder / record.CHECKPOINTS, record.LOCK))
-        stack.enter_context(_terminated_as_interrupted())
+        terminated = stack.enter_context(sigterm_as_ctrl_c())
         storage.remove_partial_files(folder)
         try:
             yield
+            finish()
         except KeyboardInterrupt as stop:
-            say(f"interrupted ({stop or 'between two steps'}); to go on: {again}", style="yellow")
-            raise SystemExit(130) from None
+            what, code = ("terminated", TERMINATED) if terminated() else ("interrupted", 130)
+            say(f"{what} ({str(stop) or 'between two steps'}); to go on: {again}", style="yellow")
+            raise SystemExit(code) from None
         except (FloatingPointError, OSError, storage.StorageError) as error:
             say(f"error: {error}; to go on: {again}", style="red")
             raise SystemExit(1) from None
-        finish()
 
 
 @contextmanager
-def _terminated_as_interrupted() -> Iterator[None]:
-    """SIGTERM, which schedulers send, is handed on as SIGINT, also in a background job."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+def sigterm_as_ctrl_c() -> Iterator[Callable[[], bool]]:
+    """Hands SIGTERM, which schedulers send, on as SIGINT, also in a background job.
+
+    Yields:
+        A function that returns whether there was a SIGTERM.
+    """
+    terminated = threading.Event()
 
     def interrupt(*_: Any) -> None:
+        terminated.set()
         if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells start "command &"
             raise KeyboardInterrupt
         signal.raise_signal(signal.SIGINT)
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    with on_sigterm(interrupt):
+        yield terminated.is_set
+
+
+@contextmanager
+def on_sigterm(handler: Callable[..., Any]) -> Iterator[None]:
+    """Handles SIGTERM while the context lasts; then what was there before is put back.
+
+    For command lines alone: a library leaves the handlers of a process as they are. In another
+    thread than the main one nothing is done.
+
+    Args:
+        handler: as `signal.signal` takes it.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, handler)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
 
 
 def needs_matplotlib(figures: bool = True) -> None:

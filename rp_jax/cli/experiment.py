@@ -106,7 +106,8 @@ def _begun(experiment: Experiment, argv: list[str]) -> Run:
     else:  # what the others write is thrown away
         folder = Path(tempfile.mkdtemp())
     facts = {"experiment": experiment.name, "preset": chosen.preset}
-    begin(folder, facts | train.facts(world, config, threats, process))
+    keep = lambda: train.keep_threat(world, process.threat, folder)  # noqa: E731
+    begin(folder, facts | train.facts(world, config, threats, process), keep)
     return Run(world, config, threats, process, folder)
 
 
@@ -131,12 +132,13 @@ def parsed(default: TrainConfig, argv: Sequence[str], name: str, about: str) -> 
     return found.config, found.process
 
 
-def begin(folder: Path, facts: Mapping[str, Any]) -> None:
-    """Writes config.json of a new run, and makes the place for its checkpoints.
+def begin(folder: Path, facts: Mapping[str, Any], keep: Callable[[], None] = lambda: None) -> None:
+    """Makes the place for the checkpoints of a new run, and writes its config.json last.
 
     Args:
         folder: of the run.
         facts: what the run depends on.
+        keep: copies what else it depends on into the folder.
 
     Raises:
         storage.StorageError: another process has just begun one there.
@@ -145,6 +147,7 @@ def begin(folder: Path, facts: Mapping[str, Any]) -> None:
         (folder / record.CHECKPOINTS).mkdir()
     except FileExistsError:
         raise storage.StorageError(f"out is {folder}; another run has begun there") from None
+    keep()
     storage.write_json(folder / "config.json", facts)
 
 
@@ -183,9 +186,17 @@ def interrupted(folder: Path, name: str, env: Any, argv: Sequence[str]) -> dict[
             f"resume is {folder}; it must be an interrupted run, but there are no checkpoints: "
             "it is finished"
         )
-    wanted = {"experiment": name, **record.machine(env)}
-    record.compared(f"resume is {folder}", plain, record.plain(wanted))
+    wanted = record.plain({"experiment": name, **record.machine(env)})
+    of_library = {key: _part(plain.get(key), value) for key, value in wanted.items()}
+    record.compared(f"resume is {folder}", plain if env is not None else of_library, wanted)
     return plain
+
+
+def _part(found: Any, wanted: Any) -> Any:
+    """Returns what was kept, of a table only the entries that are wanted."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        return {name: value for name, value in found.items() if name in wanted}
+    return found
 
 
 def resumed(experiment: Experiment, folder: Path, argv: Sequence[str]) -> Run:
@@ -207,6 +218,7 @@ def resumed(experiment: Experiment, folder: Path, argv: Sequence[str]) -> Run:
     default = experiment.presets[next(iter(experiment.presets))](experiment.recipes[0])
     config = restored(type(default), plain.get("config"), f"{path}: config")
     process = restored(Process, plain.get("process"), f"{path}: process")
+    process = train.with_own_threat(process, folder)
     if process.devices == "cluster":
         raise ValueError(f"resume is {folder}; its devices is 'cluster'; it must be 'one' or 'all'")
     world = experiment.make_world(config)

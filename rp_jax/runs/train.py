@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 
@@ -98,6 +98,9 @@ class Process:
     threat: Path | None = None  # folder of a threat function to use again
     devices: str = "one"  # "one"; "all": agents on every device; "cluster": of every process
     figures: bool = field(default_factory=can_draw)  # draw figures, with matplotlib
+
+
+Threatened = TypeVar("Threatened", bound=Any)  # a dataclass with a field `threat`
 
 
 class RunResult(NamedTuple):
@@ -207,6 +210,7 @@ def train(
         FloatingPointError: something that was seen or learned is not a finite number.
     """
     began = time.perf_counter()
+    process = with_own_threat(process, folder)
     tests, params = checked(world, config, threats, process), world.params()
     resumed = any((folder / record.CHECKPOINTS).glob("*/")) if folder.is_dir() else False
     key, env, devices = jax.random.key(0), world.env, process.devices
@@ -274,10 +278,7 @@ def threat_of(
     """
     params, place = world.params(), folder / saved.THREAT
     subs = world.env.sub_rmdps(params)
-    if process.threat is not None and not (place / "manifest.json").exists():
-        found = load_threat(process.threat, subs)
-        shutil.rmtree(place, ignore_errors=True)
-        found.save(place, record.name_of(world.env))
+    keep_threat(world, process.threat, folder)
     if process.threat is not None:
         return load_threat(place, subs)
     own = {kind: threats[kind] for kind in subs if kind in threats}
@@ -291,6 +292,40 @@ def threat_of(
         devices=process.devices,
         on_progress=on_progress,
     )
+
+
+def keep_threat(world: World, threat: Path | None, folder: Path) -> None:
+    """Copies the threat function that a run uses again into the run's folder, unless it is there.
+
+    A run that is resumed needs the copy alone: it may be called from elsewhere, and the threat
+    function that was given may be gone or another one by then.
+
+    Args:
+        world: what is learned.
+        threat: folder of the threat function; None: there is nothing to copy.
+        folder: of the run.
+
+    Raises:
+        storage.StorageError: it cannot be read, holds for another world, or cannot be written.
+    """
+    place = folder / saved.THREAT
+    if threat is not None and not (place / "manifest.json").exists():
+        found = load_threat(threat, world.env.sub_rmdps(world.params()))
+        shutil.rmtree(place, ignore_errors=True)
+        found.save(place, record.name_of(world.env))
+
+
+def with_own_threat(process: Threatened, folder: Path) -> Threatened:
+    """Returns how a run is made, with the copy of the threat function in place of the one given.
+
+    Args:
+        process: a dataclass with a field `threat`, such as `Process`.
+        folder: of the run; as `keep_threat` left it.
+    """
+    place = folder / saved.THREAT
+    if process.threat is None or not (place / "manifest.json").exists():
+        return process
+    return dataclasses.replace(process, threat=place)
 
 
 def announced(config: TrainConfig, threat: ThreatFunction | None, world: World) -> str:

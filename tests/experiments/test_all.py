@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import types
@@ -234,6 +235,20 @@ def test_ctrl_c_says_how_to_go_on(runs, tmp_path, monkeypatch, capsys):
     assert f"--resume {out}" in capsys.readouterr().out
     everything.main(["--resume", str(out), "--only", "first"])
     assert (out / "report.html").exists()
+
+
+def test_a_termination_says_how_to_go_on_and_leaves_the_handler(tmp_path, monkeypatch, capsys):
+    def terminated(*_):
+        signal.raise_signal(signal.SIGTERM)
+        pytest.fail("it went on")
+
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(module.Sources, "__call__", terminated)
+    out = tmp_path / "paper"
+    with pytest.raises(SystemExit, match="143"):
+        everything.main(["--out", str(out), "--only", "jam"])
+    assert f"--resume {out}" in capsys.readouterr().out
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 @pytest.mark.parametrize(
