@@ -23,7 +23,15 @@ from rp_jax.tabular.cmdp import FiniteCMDP
 from rp_jax.validate import number
 
 BASELINES = ("eta 0", "eta 1", "eta 2", "eta*")
-COLUMNS = ("rule", "c", "x", "return_mean", "share", "danger", "worst_danger")
+COLUMNS = {  # of the table that is shown, by field
+    "rule": "rule",
+    "c": "c, danger allowed",
+    "x": "threshold x",
+    "return_mean": "mean return",
+    "share": "share of the optimum",
+    "danger": "danger",
+    "worst_danger": "danger of the worst policy",
+}
 
 
 @dataclass(frozen=True)
@@ -195,14 +203,23 @@ def show(results: Mapping[str, Any], config: Config) -> None:
     """Prints the table for the best baseline."""
     for variant in dict.fromkeys(row["variant"] for row in results["rows"]):
         rows = [
-            {name: _cell(name, row[name]) for name in COLUMNS}
-            for row in results["rows"]
+            {words: _cell(name, row[name]) for name, words in COLUMNS.items()}
+            for row in sorted(results["rows"], key=lambda row: row["c"])
             if row["variant"] == variant and row["c"] in config.c and row["baseline"] == "eta*"
         ]
-        rows.sort(key=lambda row: float(row["c"]))
-        terminal.table(f"{variant}, baseline eta*", rows, COLUMNS)
+        terminal.table(f"{variant}, baseline eta*", rows, list(COLUMNS.values()))
     if results["programs"]:
-        rows = [{**row, "difference": f"{row['difference']:.1e}"} for row in results["programs"]]
+        rows = [
+            {
+                "variant": row["variant"],
+                "c, danger allowed": row["c"],
+                "optimum by linear program": row["linear_program"],
+                "by Lagrange multipliers": row["lagrangian"],
+                "difference": f"{row['difference']:.1e}",
+                "linear program, seconds": row["seconds"],
+            }
+            for row in results["programs"]
+        ]
         terminal.table("the optimum, twice", rows, list(rows[0]))
 
 

@@ -159,6 +159,43 @@ def test_without_its_library_an_adapter_says_what_to_install(adapter, library, a
     assert advice in " ".join(run("\n".join(lines)))
 
 
+IMPORT_ALL = """
+import importlib, os, pkgutil, signal, sys, warnings
+told = os.fdopen(os.dup(1), "w")
+sys.stdout = sys.stderr = None  # whatever asks for a terminal fails
+for foreign in FOREIGN:
+    importlib.import_module(foreign)  # what these change is not ours
+
+def state():
+    handlers = {number: signal.getsignal(number) for number in signal.valid_signals()}
+    return handlers, list(warnings.filters), dict(os.environ), os.getcwd(), record.flags()
+
+from rp_jax.runs import record
+before = state()
+for package in PACKAGES:
+    root = importlib.import_module(package)
+    for found in pkgutil.walk_packages(root.__path__, package + "."):
+        importlib.import_module(found.name)
+        if state() != before:
+            told.write(found.name + " ")
+from rp_jax.cli import terminal
+told.write(f"modules {sum(name.startswith('rp_jax.') for name in sys.modules)} ")
+told.write(f"terminals {terminal.console.cache_info().currsize}")
+"""
+
+
+def test_importing_anything_asks_for_no_terminal_and_changes_nothing_of_the_process():
+    libraries = (*FOREIGN, "matplotlib.pyplot", "flashbax", "optax", "scipy.stats", "tyro", "rich")
+    code = f"FOREIGN, PACKAGES = {libraries}, ('rp_jax', 'experiments', 'examples')\n{IMPORT_ALL}"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    (_, modules, _, terminals) = done.stdout.split()
+    assert int(modules) > 100
+    assert terminals == "0"
+
+
 def test_the_command_lines_load_no_figures():
     names = ["experiments.jam", "experiments.circuit", "experiments.point_gather"]
     assert run(f"import {', '.join(names)}, sys; print('matplotlib' in sys.modules)") == ["False"]

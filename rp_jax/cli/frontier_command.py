@@ -88,8 +88,8 @@ def show(name: str, rows: Sequence[dict[str, Any]]) -> None:
                 "x": f"{row['x']:g}",
                 "return": tables.earned(row),
                 "crashes": tables.crashed(row),
-                "% [95 %]": tables.percent(row),
-                "insecure": row["insecure"],
+                "crash rate, % [95 %]": tables.percent(row),
+                "no admissible action, % of steps": f"{100 * row['insecure']:.3f}",
             }
             for row in rows
             if row["variant"] == variant

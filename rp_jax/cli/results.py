@@ -38,7 +38,7 @@ def show_table(table: tables.Table) -> None:
                 "case": row["variant"],
                 "return over agents": tables.earned(row),
                 "crashes": tables.crashed(row),
-                "% [95 %]": tables.percent(row),
+                "crash rate, % [95 %]": tables.percent(row),
             }
             for row in table.summary
         ]
@@ -47,18 +47,12 @@ def show_table(table: tables.Table) -> None:
 
 def _show(rows: Sequence[Mapping[str, Any]]) -> None:
     cases = [f"{row['variant']} agent {row['seed']}" for row in rows]
-    lines = []
-    for name in tables.COLUMNS[4:]:
-        if name in rows[0]:
-            cells = {c: terminal.cell(row[name]) for c, row in zip(cases, rows, strict=True)}
-            lines.append({"": name, **cells})
-    hits = {c: _hits(row["collisions"]) for c, row in zip(cases, rows, strict=True)}
-    lines.append({"": "what was hit", **hits})
+    told = [tables.in_words(row) for row in rows]
+    lines = [
+        {"": name, **{case: words[name] for case, words in zip(cases, told, strict=True)}}
+        for name in told[0]
+    ]
     terminal.table(f"{rows[0]['env']}: {rows[0]['method']}", lines, ["", *cases])
-
-
-def _hits(collisions: Mapping[str, int]) -> str:
-    return ", ".join(f"{kind} {count}" for kind, count in collisions.items())
 
 
 def show_threats(rows: Sequence[Mapping[str, Any]], x: float, truth: str = "fresh labels") -> None:
@@ -73,7 +67,10 @@ def show_threats(rows: Sequence[Mapping[str, Any]], x: float, truth: str = "fres
         {
             "hazard": row["hazard"],
             "of": row["of"],
-            **{name: row[name] for name in ("mae", "rmse", "bias", "spearman")},
+            "mean abs. error": row["mae"],
+            "rms error": row["rmse"],
+            "bias": row["bias"],
+            "rank correlation": row["spearman"],
             "unsafe called safe": f"{100 * row['unsafe_called_safe']:.2f} %",
             "safe called unsafe": f"{100 * row['safe_called_unsafe']:.2f} %",
             "states missed": f"{row['states_missed']} of {row['unsafe_states']}",

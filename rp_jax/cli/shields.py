@@ -84,7 +84,7 @@ def show(name: str, rows: Sequence[Mapping[str, Any]]) -> None:
             "method": row["method"],
             "return": tables.earned(row),
             "crashes": tables.crashed(row),
-            "% [95 %]": tables.percent(row),
+            "crash rate, % [95 %]": tables.percent(row),
             "goal": f"{row['goal_rate']:.3f}",
         }
         for row in rows

@@ -34,13 +34,13 @@ def console() -> Console:
 
 
 def say(text: str, style: str | None = None) -> None:
-    """Prints a line as it is: brackets in it are no markup.
+    """Prints a line as it is: brackets in it are no markup, and :car: is no picture.
 
     Args:
         text: the line.
         style: rich's name of a colour or style.
     """
-    console().print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+    console().print(Text(text, style or ""), soft_wrap=True)
 
 
 @contextmanager
@@ -88,7 +88,7 @@ def cell(value: Any) -> str:
 
 
 def table(title: str, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:
-    """Prints rows under the names of their columns.
+    """Prints rows under the names of their columns, all texts as they are: nothing is markup.
 
     Args:
         title: above the table.
@@ -97,7 +97,7 @@ def table(title: str, rows: Sequence[Mapping[str, Any]], columns: Sequence[str])
     """
     grid = Grid(title=Text(title), title_justify="left")
     for column in columns:
-        grid.add_column(Text(column.replace("_", " ")), justify="right")
+        grid.add_column(Text(column), justify="right")
     for row in rows:
         grid.add_row(*(Text(cell(row[column])) for column in columns))
     console().print(grid)

@@ -16,7 +16,7 @@ from rp_jax.runs.agents import Agents
 from rp_jax.runs.evaluate import evaluate
 from rp_jax.runs.plan import make_pmdp, plan
 from rp_jax.runs.progress import OnMetrics, OnProgress, silent
-from rp_jax.runs.tables import Table, aligned, crashed, earned, over_seeds, percent
+from rp_jax.runs.tables import Table, aligned, crashed, earned, hits, over_seeds, percent
 from rp_jax.streams import Stream, key_of, numbered
 from rp_jax.threat.function import ThreatFunction
 from rp_jax.validate import number
@@ -51,15 +51,6 @@ class ShieldTable(Table):
             of = [row for row in self.rows if row["method"] == method]
             found += [{"method": method, **row} for row in over_seeds(of)]
         return found
-
-
-def hits(collisions: Mapping[str, int]) -> str:
-    """Returns in words what was hit, such as obstacle 12, wall 3; nothing is an empty text.
-
-    Args:
-        collisions: by kind, in how many episodes.
-    """
-    return ", ".join(f"{kind} {count:,}" for kind, count in collisions.items() if count)
 
 
 def compare_shields(

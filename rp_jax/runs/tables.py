@@ -93,6 +93,53 @@ def _line(row: Mapping[str, Any]) -> dict[str, str]:
     return found
 
 
+def in_words(row: Mapping[str, Any]) -> dict[str, str]:
+    """Returns all facts about one agent as people read them, with units.
+
+    Args:
+        row: as `evaluate` makes it, perhaps with times; files have the same facts by their fields.
+
+    Returns:
+        Texts by what they are about, in the order in which they are shown.
+    """
+    shares = {
+        "goal reached, % of episodes": row["goal_rate"],
+        "action changed by the shield, % of steps": row["interventions"],
+        "no admissible action, % of steps": row["insecure"],
+    }
+    times = {
+        "100 decisions, seconds": row.get("seconds_per_100_actions"),
+        "learning, seconds": row.get("train_seconds"),
+    }
+    return {
+        "episodes": f"{row['episodes']:,}",
+        "return, mean +- half of its 95 % interval": earned(row),
+        "return of episodes without danger, mean": _rounded(row["uncrashed_return_mean"]),
+        "crashes": crashed(row),
+        "crash rate, % [exact 95 % interval]": percent(row),
+        "danger of an episode, mean": _rounded(row["danger_mean"]),
+        **{name: f"{100 * share:.3f}" for name, share in shares.items()},
+        **{name: _rounded(seconds) for name, seconds in times.items() if seconds is not None},
+        "what was hit": hits(row["collisions"]) or "nothing",
+    }
+
+
+def _rounded(value: float) -> str:
+    """Returns a number as a cell of a table; nan is a dash."""
+    if np.isnan(value):
+        return "-"
+    return f"{value:.3g}" if abs(value) < 1 else f"{value:.2f}"
+
+
+def hits(collisions: Mapping[str, int]) -> str:
+    """Returns in words what was hit, such as obstacle 12, wall 3; nothing is an empty text.
+
+    Args:
+        collisions: by kind, in how many episodes.
+    """
+    return ", ".join(f"{kind} {count:,}" for kind, count in collisions.items() if count)
+
+
 def aligned(lines: Sequence[Mapping[str, str]]) -> str:
     """Returns rows under the names of their columns, columns that are empty left out.
 
