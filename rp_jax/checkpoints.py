@@ -48,11 +48,12 @@ class Checkpoints:
         """Returns the checkpoints of one part of the work, in a subfolder.
 
         Args:
-            name: the part's name, which is the subfolder's as well.
+            name: the part's name, from which the subfolder has its own (`storage.file_name`).
         """
         if self.folder is None:
             return self
-        return replace(self, folder=self.folder / name, name=f"{self.name} {name}".strip())
+        folder = self.folder / storage.file_name(name)
+        return replace(self, folder=folder, name=f"{self.name} {name}".strip())
 
     def begun(self) -> bool:
         """Returns whether there is a checkpoint in the folder or in any of its subfolders."""
@@ -85,7 +86,7 @@ class Checkpoints:
         Raises:
             KeyboardInterrupt: the user pressed Ctrl-C; the message says how many steps are done.
             storage.StorageError: a checkpoint cannot be written (older ones are still valid), or
-                was written by a run with other settings.
+                was written by a run with other settings, or in another precision.
         """
         if self.folder is None:
             for i in range(length):
@@ -136,6 +137,8 @@ class Checkpoints:
                 done = int(path.name)
                 like = result(state) if done == length else state
                 found = storage.load(path, KIND, like) if ours else None
+            except storage.PrecisionError as error:  # the work is not lost: it is not begun anew
+                raise storage.PrecisionError(f"{error}; go on with that setting") from error
             except storage.StorageError as error:
                 self.say(f"warning: {error}; going back to what is older")
                 continue

@@ -9,7 +9,9 @@ import math
 import os
 import re
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
@@ -26,8 +28,19 @@ FORMAT = 2  # version of the manifest's layout
 PART = ".part"  # suffix of files that are still being written
 
 
+PRECISIONS = ({"float32", "float64"}, {"int32", "int64"}, {"uint32", "uint64"})
+
+
 class StorageError(ValueError):
     """A file is damaged, is of another kind, or cannot be written."""
+
+
+class PrecisionError(StorageError):
+    """Arrays were saved in single precision and are read in double, or the other way round."""
+
+
+class PrecisionWarning(UserWarning):
+    """Arrays were saved in another precision than they are read in, and were converted."""
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -107,11 +120,15 @@ def plain(value: Any) -> Any:
     Args:
         value: mappings, sequences, dataclasses, arrays, paths, numbers and strings, nested.
             Dataclasses become mappings, arrays lists, paths strings, nan None, and infinity "inf"
-            or "-inf".
+            or "-inf". Keys of mappings become strings.
+
+    Raises:
+        ValueError: two keys of a mapping become the same string.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = dataclasses.asdict(value)
     if isinstance(value, Mapping):
+        _check_apart("keys of a table", [str(k) for k in value])
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]
@@ -122,6 +139,34 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not np.isfinite(value):
         return None if np.isnan(value) else "inf" if value > 0 else "-inf"
     return value
+
+
+def _check_apart(what: str, names: Sequence[str]) -> None:
+    """Raises ValueError, naming one, if two names are the same: one of their values would be lost.
+
+    Args:
+        what: is named so.
+        names: which must differ.
+    """
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise ValueError(f"{what}: {name!r} is there {count} times; each must be there once")
+
+
+def file_name(text: str) -> str:
+    """Returns a name for a file or folder, another one for every text, on any file system.
+
+    Texts of small letters, digits, spaces and a few signs are their own names. Others end with a
+    checksum: where large and small letters are the same, or accents are written in several ways,
+    texts that differ in these alone are kept apart.
+
+    Args:
+        text: any text, such as the name that a user gave to a test.
+    """
+    if re.fullmatch(r"(?=.*[a-z])[a-z0-9=_-](?:[a-z0-9=_. -]{0,98}[a-z0-9=_-])?", text):
+        return text
+    checksum = hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
+    return f"{re.sub(r'[^A-Za-z0-9=_-]', '_', text)[:60]}~{checksum[:16]}"
 
 
 def new_folder(path: Path) -> Path:
@@ -209,8 +254,9 @@ def statics(part: Any, path: str = "") -> dict[str, Any]:
     if isinstance(part, list | tuple):
         part = dict(enumerate(part))
     if isinstance(part, Mapping):
+        _check_apart(f"keys of {path or 'a tree'}", [str(name) for name in part])
         for name, value in part.items():
-            found |= statics(value, f"{path}{name}/")
+            found |= statics(value, f"{path}{_escaped(str(name))}/")
     for field in dataclasses.fields(part) if dataclasses.is_dataclass(part) else ():
         value, name = getattr(part, field.name), path + field.name
         if field.metadata.get("pytree_node", True):
@@ -282,9 +328,24 @@ def _is_plain(value: Any) -> bool:
 
 
 def _flat(tree: Any) -> dict[str, Any]:
-    """Returns the leaves of a pytree by their paths, such as "params/dense/kernel"."""
+    """Returns the leaves of a pytree by their paths, such as "params/dense/kernel".
+
+    In keys with "/" or "~" these are written "~1" and "~0", as in a JSON pointer (RFC 6901), so
+    that {"a/b": x} and {"a": {"b": x}} have paths of their own.
+
+    Raises:
+        ValueError: two keys that are not strings have the same text.
+    """
     flat, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): a for path, a in flat}
+    part = lambda key: _escaped(jax.tree_util.keystr((key,), simple=True))  # noqa: E731
+    names = ["/".join(map(part, path)) for path, _ in flat]
+    _check_apart("paths of arrays", names)
+    return {name: a for name, (_, a) in zip(names, flat, strict=True)}
+
+
+def _escaped(key: str) -> str:
+    """Returns a key as a part of a path, without "/"."""
+    return key.replace("~", "~0").replace("/", "~1")
 
 
 def _is_key(a: Any) -> bool:
@@ -435,7 +496,7 @@ def read_manifest(folder: Path, kind: str) -> dict[str, Any]:
     return manifest
 
 
-def load(folder: Path, kind: str, like: Any) -> Any:
+def load(folder: Path, kind: str, like: Any, *, convert: bool = False) -> Any:
     """Returns the pytree that `save` wrote, in the structure of `like`.
 
     Every array must have the shape and type of its counterpart in `like`, and the file must have
@@ -447,8 +508,11 @@ def load(folder: Path, kind: str, like: Any) -> Any:
         kind: the kind given to `save`.
         like: pytree of arrays and random keys; `jax.ShapeDtypeStruct` may stand for an array. Where
             it has a numpy array, so has the result.
+        convert: whether numbers of another precision (jax_enable_x64) are converted, which a
+            `PrecisionWarning` tells of.
 
     Raises:
+        PrecisionError: they are not to be converted, or cannot be.
         StorageError: something is missing, damaged, or of another shape.
     """
     folder = Path(folder)
@@ -459,17 +523,21 @@ def load(folder: Path, kind: str, like: Any) -> Any:
     if set(manifest["arrays"]) != set(facts):
         odd = sorted(set(manifest["arrays"]) ^ set(facts))
         raise StorageError(f"{path}: arrays are missing or too many: {', '.join(odd[:4])}")
-    for name, want in facts.items():
-        have = manifest["arrays"][name]
-        if have != want:
-            raise StorageError(f"{path}: {name} is {_named(have)}; it must be {_named(want)}")
-    data = _read_arrays(folder, manifest, sum(map(_size, facts.values())))
+    saved = manifest["arrays"]
+    others = [name for name, want in facts.items() if _check_facts(path, name, saved, want)]
+    if others and not convert:
+        raise PrecisionError(_told(path, others[0], saved, facts))
+    data = _read_arrays(folder, manifest, sum(_size(saved[name]) for name in facts))
     found, start = {}, 0
-    for name in manifest["arrays"]:
-        want = facts[name]
-        end = start + _size(want)
-        found[name] = _restored(data[start:end], want, expected[name])
+    for name, have in saved.items():
+        end = start + _size(have)
+        array = _array_of(data[start:end], have)
+        if have != facts[name]:
+            array = _converted(array, facts[name]["dtype"], f"{path}: {name}")
+        found[name] = _restored(array, expected[name])
         start = end
+    if others:
+        warnings.warn(_told(path, others[0], saved, facts), PrecisionWarning, stacklevel=2)
     return jax.tree.unflatten(jax.tree.structure(like), [found[name] for name in expected])
 
 
@@ -503,7 +571,7 @@ def load_some(folder: Path, kind: str, like: Mapping[str, Any]) -> dict[str, Any
     for name, about in facts.items():
         end = start + _size(about)
         if name in like:
-            found[name] = _restored(data[start:end], about, like[name])
+            found[name] = _restored(_array_of(data[start:end], about), like[name])
         start = end
     return found
 
@@ -533,10 +601,54 @@ def _read_arrays(folder: Path, manifest: Mapping[str, Any], size: int) -> memory
     return memoryview(data)
 
 
-def _restored(data: memoryview, facts: Mapping[str, Any], like: Any) -> Any:
-    """Returns one array from its bytes: a key, a numpy array or a JAX array, as `like` is."""
+def _check_facts(path: Path, name: str, saved: Mapping[str, Any], want: Any) -> bool:
+    """Returns whether an array was saved in another precision than is wanted.
+
+    Raises:
+        StorageError: it is of another shape, or another type altogether.
+    """
+    have = saved[name]
+    if have == want:
+        return False
+    dtype = have.get("dtype") if isinstance(have, dict) else None
+    same = isinstance(dtype, str) and have == {**want, "dtype": dtype}
+    if same and {dtype, want["dtype"]} in PRECISIONS:
+        return True
+    raise StorageError(f"{path}: {name} is {_named(have)}; it must be {_named(want)}")
+
+
+def _told(path: Path, name: str, saved: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
+    """Returns what is said of arrays in another precision."""
+    have, want = saved[name], facts[name]
+    double = have["dtype"].endswith("64")
+    return (
+        f"{path}: {name} is {_named(have)}, saved with jax_enable_x64={double}; here it is "
+        f"{_named(want)}, with jax_enable_x64={not double}"
+    )
+
+
+def _converted(array: np.ndarray, dtype: str, where: str) -> np.ndarray:
+    """Returns an array in another precision.
+
+    Raises:
+        PrecisionError: a number is too large for it.
+    """
+    with np.errstate(over="ignore"):
+        found = array.astype(dtype)
+    exact = found == array if found.dtype.kind in "iu" else np.isfinite(found) == np.isfinite(array)
+    if not np.all(exact):
+        raise PrecisionError(f"{where} is {array.dtype}; a number in it is too large for {dtype}")
+    return found
+
+
+def _array_of(data: memoryview, facts: Mapping[str, Any]) -> np.ndarray:
+    """Returns one array from its bytes."""
     dtype = jax.numpy.dtype(facts["dtype"])
-    array = np.frombuffer(data, dtype).reshape(facts["shape"]).copy()
+    return np.frombuffer(data, dtype).reshape(facts["shape"]).copy()
+
+
+def _restored(array: np.ndarray, like: Any) -> Any:
+    """Returns an array as a key, a numpy array or a JAX array, as `like` is."""
     if isinstance(like, np.ndarray | np.generic):
         return array[()]
     if _is_key(like):

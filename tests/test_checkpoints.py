@@ -265,3 +265,29 @@ def test_whatever_operation_fails_nothing_is_lost(error, kept):
             assert all(str(error.strerror) in line for line in told)
         assert resumed(kept) == WANTED
         shutil.rmtree(kept.folder)
+
+
+def test_a_loop_of_another_precision_is_not_begun_anew(tmp_path, monkeypatch):
+    monkeypatch.setattr("rp_jax.checkpoints.INTERVAL", 0.0)
+    here = Checkpoints(tmp_path, name="counting", say=lambda text: pytest.fail(text))
+    with pytest.raises(FloatingPointError):
+        here.loop(jnp.zeros(2), half_way, 4)
+    with jax.enable_x64(True):
+        says = "saved with jax_enable_x64=False; here it is .* go on with that setting"
+        with pytest.raises(storage.PrecisionError, match=says):
+            here.loop(jnp.zeros(2), half_way, 4)
+
+
+def half_way(i, state):
+    if i == 2:
+        raise FloatingPointError
+    return state + 1
+
+
+def test_parts_of_the_work_have_folders_of_their_own_whatever_their_names(tmp_path):
+    here = Checkpoints(tmp_path / "job")
+    names = ["a/b", "a:b", "A", "a", "..", "00000003", ""]
+    folders = [here.at(name).folder for name in names]
+    assert len({str(folder).casefold() for folder in folders}) == len(names)
+    assert all(folder.parent == tmp_path / "job" for folder in folders)
+    assert not any(folder.name.isdecimal() for folder in folders)

@@ -2,9 +2,11 @@ import errno
 import functools
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
+import unicodedata
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 
 from rp_jax import storage
 from rp_jax.storage import StorageError
@@ -580,3 +583,127 @@ def test_numpy_scalars_come_back_with_their_type(tmp_path):
     found = storage.load(tmp_path, "kind", tree)
     assert storage.checksum(found) == storage.checksum(tree)
     assert found["a"] == np.float64(0.1)
+
+
+AMBIGUOUS = [
+    {"a/b": jnp.ones(2), "a": {"b": jnp.zeros(2)}},
+    {"a~1b": jnp.ones(2), "a/b": jnp.zeros(2), "a": {"b": jnp.full(2, 2.0)}},
+    {"a~b": jnp.ones(2), "a~0b": jnp.zeros(2)},
+    {"": {"": jnp.ones(2)}, "/": jnp.zeros(2), "a": {"": jnp.full(2, 2.0), "/": jnp.full(2, 3.0)}},
+    {"a": [jnp.ones(2), jnp.zeros(2)], "a/0": jnp.full(2, 2.0)},
+    {"a.b": jnp.ones(2), "a": {".b": jnp.zeros(2)}, "a\\b": jnp.full(2, 2.0)},
+    {"A": jnp.ones(2), "a": jnp.zeros(2)},
+    {"\u00e9": jnp.ones(2), "e\u0301": jnp.zeros(2)},  # one letter, written in two ways
+    {1: {2: jnp.ones(2)}, 12: jnp.zeros(2)},
+    {(0, 1): jnp.ones(2), (1, 0): jnp.zeros(2)},
+]
+
+
+@pytest.mark.parametrize("tree", AMBIGUOUS, ids=lambda tree: " ".join(map(repr, tree)))
+def test_arrays_are_kept_apart_whatever_their_keys(tree, tmp_path):
+    storage.save(tmp_path, "thing", tree, {})
+    found = storage.load(tmp_path, "thing", jax.tree.map(jnp.zeros_like, tree))
+    assert jax.tree.structure(found) == jax.tree.structure(tree)
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool((a == b).all()), found, tree))
+    assert len(storage.leaves(tree)) == len(jax.tree.leaves(tree))
+
+
+class Named:
+    """A key that is ordered, but has the text of every other one."""
+
+    def __init__(self, number):
+        self.number = number
+
+    def __lt__(self, other):
+        return self.number < other.number
+
+    def __repr__(self):
+        return "named"
+
+
+def test_keys_of_one_text_are_refused_by_it(tmp_path):
+    tree = {Named(1): jnp.ones(2), Named(2): jnp.zeros(2)}
+    with pytest.raises(ValueError, match="'named' is there 2 times; each must be there once"):
+        storage.save(tmp_path / "new", "thing", tree, {})
+    with pytest.raises(ValueError, match="keys of a table: '1' is there 2 times"):
+        storage.plain({"about": {1: "one", "1": "another"}})
+
+
+def test_static_fields_are_kept_apart_whatever_the_keys():
+    class Part(struct.PyTreeNode):
+        size: int = struct.field(pytree_node=False)
+
+    found = storage.statics({"a/b": Part(1), "a": {"b": Part(2)}})
+    assert found == {"a~1b/size": 1, "a/b/size": 2}
+    with pytest.raises(ValueError, match="'1' is there 2 times"):
+        storage.statics({1: Part(1), "1": Part(2)})
+
+
+def test_every_text_has_a_file_name_of_its_own():
+    texts = [
+        *("slip 0.1", "n=8", "a", "A", "a/b", "a:b", "a_b", "a b", "a\\b", "../a", "..", ".", ""),
+        *(
+            " a",
+            "a ",
+            "a.",
+            ".a",
+            "00000001",
+            "\u00e9",
+            "e\u0301",
+            "N=8",
+            "x" * 300,
+            "x" * 301,
+            "~",
+        ),
+        *("a\0b", "a\nb", "\ud800", storage.file_name("A")),
+    ]
+    names = [storage.file_name(text) for text in texts]
+    assert names[:3] == texts[:3]  # plain ones are their own names
+    folded = {unicodedata.normalize("NFC", name).casefold() for name in names}
+    assert len(folded) == len(texts)
+    for name in names:
+        assert re.fullmatch(r"[A-Za-z0-9=_~][A-Za-z0-9=_. ~-]*", name), name
+        assert len(name) < 120
+        assert not name.isdecimal()
+        assert not name.endswith((" ", "."))
+
+
+NUMBERS = {"a": jnp.asarray([1.5, jnp.nan]), "n": jnp.asarray([7], jnp.int32)}
+
+
+def test_numbers_of_another_precision_are_converted_and_said_so(tmp_path):
+    storage.save(tmp_path / "single", "thing", NUMBERS, {})
+    with jax.enable_x64(True):
+        double = {"a": jnp.asarray([1 / 3, jnp.inf]), "n": jnp.asarray([-7], jnp.int64)}
+        storage.save(tmp_path / "double", "thing", double, {})
+        says = r"a is float32\[2\], saved with jax_enable_x64=False; here it is float64\[2\], with "
+        with pytest.warns(storage.PrecisionWarning, match=says + "jax_enable_x64=True"):
+            found = storage.load(tmp_path / "single", "thing", double, convert=True)
+        assert (found["a"].dtype, found["n"].dtype) == (np.float64, np.int64)
+        np.testing.assert_array_equal(found["a"], [1.5, np.nan])
+    says = r"a is float64\[2\], saved with jax_enable_x64=True; here it is float32"
+    with pytest.warns(storage.PrecisionWarning, match=says):
+        found = storage.load(tmp_path / "double", "thing", NUMBERS, convert=True)
+    assert (found["a"].dtype, found["n"].dtype) == (np.float32, np.int32)
+    np.testing.assert_array_equal(found["a"], np.asarray([1 / 3, np.inf], np.float32))
+    assert found["n"] == -7
+
+
+def test_numbers_of_another_precision_are_refused_where_they_must_be_the_same_bits(tmp_path):
+    storage.save(tmp_path, "thing", NUMBERS, {})
+    with jax.enable_x64(True):
+        like = {"a": jnp.zeros(2), "n": jnp.zeros(1, jnp.int32)}
+        with pytest.raises(storage.PrecisionError, match="saved with jax_enable_x64=False; here"):
+            storage.load(tmp_path, "thing", like)
+        like = {"a": jnp.zeros(3), "n": jnp.zeros(1, jnp.int32)}
+        with pytest.raises(StorageError, match=r"a is float32\[2\]; it must be float64\[3\]"):
+            storage.load(tmp_path, "thing", like, convert=True)
+
+
+@pytest.mark.parametrize(("large", "dtype"), [(2**40, "int32"), (1e300, "float32")])
+def test_what_is_too_large_for_single_precision_is_named(large, dtype, tmp_path):
+    with jax.enable_x64(True):
+        storage.save(tmp_path, "thing", {"a": jnp.asarray([large])}, {})
+    says = f"a is {dtype[:-2]}64; a number in it is too large for {dtype}"
+    with pytest.raises(storage.PrecisionError, match=says):
+        storage.load(tmp_path, "thing", {"a": jnp.zeros(1, dtype)}, convert=True)

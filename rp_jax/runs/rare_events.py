@@ -263,4 +263,4 @@ def load_starts(folder: Path, pmdp: PMDP, about: dict[str, Any]) -> Any:
     number(f"{folder}: count", found.get("count"), least=1, most=MOST_STARTS, integer=True)
     one = jax.eval_shape(pmdp.env.reset, jax.random.key(0), pmdp.params)
     like = jax.tree.map(lambda a: jax.ShapeDtypeStruct((found["count"], *a.shape), a.dtype), one)
-    return storage.load(folder, STARTS, like)
+    return storage.load(folder, STARTS, like, convert=True)

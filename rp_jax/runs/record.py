@@ -307,8 +307,18 @@ def compared(where: str, found: Mapping[str, Any], wanted: Mapping[str, Any]) ->
                 )
             raise ValueError(
                 f"{where}; its {name} is {odd}; it must be {now} to come to the same bits: repeat "
-                "the call that began it, or begin in another folder"
+                f"the call that began it, or begin in another folder{_why(odd)}"
             )
+
+
+def _why(odd: Any) -> str:
+    """Returns what a user may not think of, where a checksum of arrays differs."""
+    if not (isinstance(odd, str) and re.fullmatch("[0-9a-f]{32}", odd)):
+        return ""
+    return (
+        " (a checksum of its numbers; these also differ with the precision: jax_enable_x64 is "
+        f"{flags()['jax_enable_x64']} here)"
+    )
 
 
 @contextlib.contextmanager
@@ -333,7 +343,7 @@ def job(
     if folder is None:
         yield NO_CHECKPOINTS
         return
-    place, wanted = Path(folder) / CHECKPOINTS / re.sub(r"[^\w=. -]", "_", name), plain(spec)
+    place, wanted = Path(folder) / CHECKPOINTS / storage.file_name(name), plain(spec)
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -272,7 +272,8 @@ def restored_agents(
     weights = jax.tree.map(
         lambda s: jax.ShapeDtypeStruct((len(members), *s.shape), s.dtype), shapes
     )
-    tree = storage.load(folder / AGENTS, KIND, {"weights": weights, "params": _claimed(folder)})
+    like = {"weights": weights, "params": _claimed(folder)}
+    tree = storage.load(folder / AGENTS, KIND, like, convert=True)
     history = _history(folder / METRICS)
     return Agents(
         pmdp,
@@ -318,7 +319,8 @@ def _difference(
     old, new = storage.statics(made), storage.statics(params)
     odd = {name: value for name, value in new.items() if old.get(name) != value}
     simple = all(isinstance(v, str | int | float | bool) for v in odd.values())
-    if had.keys() != have.keys() or old.keys() != new.keys() or not simple:
+    plain = not any("." in name or "~" in name for name in have)  # paths are told apart below
+    if had.keys() != have.keys() or old.keys() != new.keys() or not (simple and plain):
         return None, {}
     changed = {
         name.replace("/", "."): value
@@ -361,7 +363,10 @@ def _parameters(folder: Path, env: Any, about: Mapping[str, Any]) -> Any:
         odd = set(claimed) - set(names)
         if odd:
             raise storage.StorageError(f"{where}: parameters have no {', '.join(sorted(odd))}")
-        values = [changed.get(f"params/{n}", a) for n, (_, a) in zip(names, flat, strict=True)]
+        values = [
+            jnp.asarray(changed[f"params/{n}"], jnp.asarray(a).dtype) if n in claimed else a
+            for n, (_, a) in zip(names, flat, strict=True)
+        ]
         made = jax.tree.unflatten(structure, values)
     return _with_statics(made, facts.get("statics") or {})
 

@@ -70,7 +70,7 @@ def evaluate_search(
     with record.job(where, "MPC", spec) as checkpoints:
         for test, search in searches.items():
             own = key_of(key, Stream.SEARCH)
-            at, stage = checkpoints.at(test or "all"), f"search {test}".strip()
+            at, stage = checkpoints.at(f"test {test}"), f"search {test}".strip()
             found, seconds = play_search(own, search, episodes, stage, on_progress, at)
             evaluation.check(found, stage)
             alone = time_search(key, search)

@@ -88,7 +88,8 @@ def load(
         subs: the sub-R-MDPs that the models must hold for, by kind of hazard.
 
     Returns:
-        The models, and the sub-R-MDPs that they were saved with, by kind of hazard.
+        The models, and the sub-R-MDPs that they were saved with, by kind of hazard; converted,
+        with a `storage.PrecisionWarning`, if they were saved in another precision.
 
     Raises:
         storage.StorageError: the file is damaged, or holds for another environment, other
@@ -103,7 +104,7 @@ def load(
         kind: {"model": _blank(folder, kind, networks[kind], sub), "sub": sub}
         for kind, sub in subs.items()
     }
-    tree = storage.load(folder, KIND, like)
+    tree = storage.load(folder, KIND, like, convert=True)
     for kind, sub in subs.items():
         same_sub(f"{folder}: {kind}", tree[kind]["sub"], sub)
     models, known_subs = ({kind: tree[kind][part] for kind in subs} for part in ("model", "sub"))

@@ -20,7 +20,7 @@ from rp_jax import LoopConfig, ThreatConfig
 from rp_jax.envs import jam
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.runs.saved import about_agents
-from rp_jax.storage import StorageError
+from rp_jax.storage import PrecisionWarning, StorageError
 from rp_jax.streams import Stream, key_of
 from rp_jax.threat.fit import FitConfig
 
@@ -451,3 +451,42 @@ def test_facts_of_agents_are_readable(agents, tmp_path):
     assert about["env"] == "probe"
     assert about["observation"] == {"scan": 2, "rest": 2}
     assert about["members"][1] == {"seed": 1, "x": 0.5, "learning_penalty": 0.0}
+
+
+def loaded(folder, says):
+    """What is in a folder of another precision, which a warning tells of."""
+    with pytest.warns(PrecisionWarning, match=says):
+        return rp_jax.load(folder, probe)
+
+
+def test_agents_serve_in_another_precision_and_it_is_said_so(agents, tmp_path):
+    """There and back: double precision holds all that single does."""
+    rp_jax.save(tmp_path / "single", agents)  # slip is kept as an array: the settings are not given
+    says = r"is float32\[.*, saved with jax_enable_x64=False; here it is float64"
+    with jax.enable_x64(True):
+        double = loaded(tmp_path / "single", says)
+        starts = jax.vmap(probe.start_at)(jnp.arange(2.0, 5.0))
+        assert double.pmdp.params.slip.dtype == np.float64
+        assert double.pmdp.params.slip == np.float32(0.2)
+        there = [agent.act(starts).tolist() for agent in double]
+        rp_jax.save(tmp_path / "double", double)
+    assert there == [agent.act(STARTS).tolist() for agent in agents]
+    back = loaded(tmp_path / "double", "saved with jax_enable_x64=True; here it is float32")
+    same(back.weights, agents.weights)
+    same(back.pmdp.params, agents.pmdp.params)
+    same(back.pmdp.threats, agents.pmdp.threats)
+    assert back.pmdp.params.slip.dtype == np.float32
+
+
+def test_a_threat_function_serves_in_another_precision(threat, tmp_path):
+    rp_jax.save(tmp_path, threat)
+    with jax.enable_x64(True):
+        found = loaded(tmp_path, "saved with jax_enable_x64=False")
+        assert found.models["pit"].source.radius.dtype == np.float64
+
+
+def test_a_finished_job_of_another_precision_is_refused_by_its_name(threat, params, tmp_path):
+    ask = functools.partial(rp_jax.plan, x=0.5, config=LEARNER, folder=tmp_path)
+    ask(KEY, probe, params, threat)
+    with jax.enable_x64(True), pytest.raises(ValueError, match="jax_enable_x64 is True here"):
+        ask(jax.random.key(0), probe, probe.make_params(slip=0.2))

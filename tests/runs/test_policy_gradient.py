@@ -37,7 +37,7 @@ def test_an_interrupted_job_goes_on_to_the_same_bits(method, tmp_path, monkeypat
     apart, at_once = tmp_path / "apart", tmp_path / "at_once"
     with stopped_after(3, monkeypatch), pytest.raises(KeyboardInterrupt, match="3 done"):
         learn(method, apart)
-    assert any((apart / "checkpoints" / method).iterdir())
+    assert any((apart / "checkpoints" / storage.file_name(method)).iterdir())
     found, whole = learn(method, apart), learn(method, at_once)
     jax.tree.map(np.testing.assert_array_equal, found.weights, whole.weights)
     assert untimed(apart) == untimed(at_once)

@@ -87,3 +87,25 @@ def test_the_versions_of_a_world_s_own_packages_count(tmp_path, monkeypatch):
     room = importlib.import_module("odd_room")
     assert set(record.versions_of(room)) == {*record.versions_of(jam), "chex"}
     del sys.modules["odd_room"]
+
+
+def test_jobs_whose_names_differ_in_signs_alone_keep_apart(tmp_path):
+    """Interrupted in the second test, the first one is done again and does not meet its files."""
+
+    def go(name, fails=False):
+        with record.job(tmp_path, f"evaluation {name}", {"test": name}):
+            if fails:
+                raise KeyboardInterrupt
+
+    go("a/b")
+    with pytest.raises(KeyboardInterrupt):
+        go("a:b", fails=True)
+    for name in ("a/b", "A:b", "a:b"):
+        go(name)
+    assert not (tmp_path / record.CHECKPOINTS).exists()
+
+
+def test_a_checksum_that_differs_reminds_of_the_precision():
+    found, wanted = {"params": 32 * "a"}, {"params": 32 * "b"}
+    with pytest.raises(ValueError, match="precision: jax_enable_x64 is False here"):
+        record.compared("folder is x", found, wanted)

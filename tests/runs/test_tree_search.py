@@ -36,7 +36,7 @@ def test_it_goes_on_where_it_was_interrupted_and_keeps_whole_tests(tmp_path, mon
     with stopped_after(3, monkeypatch), pytest.raises(KeyboardInterrupt):  # the last of N=1
         evaluated(tmp_path / "apart")
     assert untimed(evaluated(tmp_path / "apart").rows) == untimed(at_once)
-    assert "MPC N=1: 3 of 3 were done" in capsys.readouterr().out
+    assert "MPC test N=1: 3 of 3 were done" in capsys.readouterr().out
     assert not (tmp_path / "apart" / "checkpoints").exists()
 
 
