@@ -141,7 +141,7 @@ def imported(name: Any) -> Any:
     except (ImportError, TypeError, ValueError) as error:  # the latter two of names like ".world"
         raise storage.StorageError(
             f"env is {name!r}, which cannot be imported ({error}); it must be a module, such as "
-            "rp_jax.envs.jam"
+            "rp_jax.envs.jam; one's own must be in the folder of the call, or on PYTHONPATH"
         ) from error
 
 

@@ -2,7 +2,11 @@
 
 import dataclasses
 import json
+import shutil
+from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import pytest
 from tiny import programs_of_a_moment  # noqa: F401
 
@@ -12,7 +16,10 @@ from rp_jax.baselines.actor_critic import ActorCriticConfig
 from rp_jax.baselines.cpo import CPOConfig
 from rp_jax.baselines.pid_lagrangian import PIDConfig
 from rp_jax.cli import experiment
+from rp_jax.envs import circuit
 from rp_jax.runs import policy_gradient, record
+from rp_jax.threat import artefact
+from rp_jax.threat.model import ThreatModel, ThreatNetwork
 
 SMALL = {"num-envs": 8, "length": 16, "epochs": 1, "minibatches": 2}
 
@@ -109,6 +116,33 @@ def test_settings_come_back_from_the_file(tmp_path, monkeypatch):
     assert run.config == compare.settings_of(config)
     assert run.world.name == "jam"
     assert folder == tmp_path
+
+
+def test_it_is_resumed_from_elsewhere_with_its_own_copy_of_the_threats(tmp_path, monkeypatch):
+    home, other = tmp_path / "home", tmp_path / "other"
+    home.mkdir()
+    other.mkdir()
+    subs = circuit.sub_rmdps(circuit.make_params())
+    network = ThreatNetwork((4,), 15)
+    weights = network.init(jax.random.key(0), jnp.zeros(3))
+    wall = ThreatModel(subs["wall"].source, weights, jnp.ones(3), jnp.zeros(()), network)
+    artefact.save(home / "threats", "rp_jax.envs.circuit", {"wall": wall}, subs, {})
+    went_on = []
+
+    def job(config, run, folder):
+        went_on.append(run.process.threat)
+        if len(went_on) == 1:
+            raise KeyboardInterrupt
+
+    command = compare.COMMAND._replace(job=job)
+    monkeypatch.chdir(home)
+    words = ["--env", "circuit", "--steps", "6000", "--threat", "threats", "--out", "run"]
+    with pytest.raises(SystemExit, match="130"):
+        compare.main(command, words)
+    shutil.rmtree("threats")
+    monkeypatch.chdir(other)
+    compare.main(command, ["--resume", "../home/run"])
+    assert went_on == [Path("threats"), Path("../home/run/threat")]
 
 
 @pytest.mark.parametrize(
