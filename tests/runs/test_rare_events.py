@@ -28,6 +28,19 @@ def test_worst_starts_of_another_task_or_in_no_number_are_refused(tmp_path):
             rare_events.load_starts(tmp_path / "set", pmdp, about)
 
 
+def test_worst_starts_serve_in_another_precision(tmp_path):
+    pmdp = types.SimpleNamespace(env=jam, params=jam.make_params(3))
+    about = {"env": "jam", "variant": "N=3"}
+    one = jax.tree.map(lambda a: a[None], jam.reset(jax.random.key(0), pmdp.params))
+    storage.save(tmp_path, rare_events.STARTS, one, about | {"count": 1})
+    with jax.enable_x64(True):
+        double = types.SimpleNamespace(env=jam, params=jam.make_params(3))
+        with pytest.warns(storage.PrecisionWarning, match="saved with jax_enable_x64=False"):
+            found = rare_events.load_starts(tmp_path, double, about)
+        assert found.body.position.dtype == np.float64
+        np.testing.assert_array_equal(found.body.position, one.body.position)
+
+
 def test_the_search_for_worst_starts_descends_from_many_and_keeps_none_twice():
     params = jam.make_params(3)
     keys = jax.random.split(jax.random.key(0), 6)
