@@ -277,7 +277,7 @@ def show(rows: Rows) -> None:
                     "seed": row["seed"],
                     "return": tables.earned(row),
                     "crashes": tables.crashed(row),
-                    "crash rate, % [95 %]": tables.percent(row),
+                    **tables.rates(row),
                     "steps": f"{row['training_steps']:,}" if row["training_steps"] else "-",
                     "crashes while learning": learned if row["training_steps"] else "-",
                     "learning, s": took if row["training_steps"] else "-",

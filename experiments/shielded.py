@@ -226,7 +226,7 @@ def show(rows: Sequence[dict[str, Any]]) -> None:
             "policy": row["policy"],
             "shield": row["shield"],
             "crashes": f"{row['crashes']:,}",
-            "crash rate, % [95 %]": tables.percent(row),
+            **tables.rates(row),
             "return": tables.earned(row),
             "replaced %": f"{100 * row['interventions']:.1f}",
         }

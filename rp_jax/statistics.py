@@ -1,5 +1,8 @@
 """Confidence intervals for rates and means, over episodes and over seeds."""
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 from scipy import stats
 
@@ -141,6 +144,117 @@ def mean_interval(values: np.ndarray, confidence: float = 0.95) -> tuple[float, 
         return float(values.mean()), float("nan")
     width = stats.t.ppf((1 + confidence) / 2, n - 1) * values.std(ddof=1) / np.sqrt(n)
     return float(values.mean()), float(width)
+
+
+def cluster_interval(
+    events: Sequence[int], trials: Sequence[int], confidence: float = 0.95
+) -> tuple[float, float]:
+    """Returns a confidence interval of the mean rate of clusters that may differ, such as seeds.
+
+    `clopper_pearson` of all trials together speaks of these clusters alone. This interval speaks of
+    what they were drawn from: it holds the mean rate of all clusters that might have been drawn. It
+    is that of Korn and Graubard (1998): Clopper and Pearson's, for as many independent trials as
+    would have the variance that is seen between the clusters, and fewer still for how badly few
+    clusters tell it. The variance is never taken to be less than that of independent trials, so the
+    interval is the wider one of the two.
+
+    Args:
+        events: (g,) number of events in each cluster.
+        trials: (g,) number of trials in each cluster.
+        confidence: probability with which the interval holds the mean rate, in (0, 1). It is kept,
+            or missed by a few per cent where rates differ by more than their mean; tests say how
+            much (docs/statistics.md).
+
+    Returns:
+        (lower, upper) end; (0, 1) for a single cluster, which says nothing of others.
+
+    Raises:
+        ValueError: a number is out of range, or there are no clusters.
+    """
+    _check_confidence(confidence)
+    if len(events) != len(trials):
+        raise ValueError(
+            f"events has {len(events)} clusters and trials {len(trials)}; they must have as many"
+        )
+    number("number of clusters", len(trials), least=1, integer=True)
+    for k, n in zip(events, trials, strict=True):
+        number("trials", n, least=1, integer=True)
+        number("events", k, least=0, most=n, integer=True)
+    if len(trials) == 1:
+        return 0.0, 1.0
+    total, happened = float(sum(trials)), float(sum(events))
+    at = (1 + confidence) / 2
+    shrunk = (stats.t.ppf(at, total - 1) / stats.t.ppf(at, len(trials) - 1)) ** 2
+    share = shrunk / _design_effect(np.asarray(events), np.asarray(trials))
+    k, others = share * happened, share * (total - happened)
+    lower = float(stats.beta.ppf(1 - at, k, others + 1)) if happened > 0 else 0.0
+    upper = float(stats.beta.ppf(at, k + 1, others)) if happened < total else 1.0
+    return lower, upper
+
+
+def cluster_upper_bound(
+    events: Sequence[int], trials: Sequence[int], confidence: float = 0.95
+) -> float:
+    """Returns a one-sided upper confidence bound of the mean rate of clusters that may differ.
+
+    Args:
+        events: (g,) number of events in each cluster, as for `cluster_interval`.
+        trials: (g,) number of trials in each cluster.
+        confidence: probability with which the mean rate is at most the bound, above .5.
+
+    Raises:
+        ValueError: a number is out of range, or there are no clusters.
+    """
+    _check_confidence(confidence)
+    number("confidence", confidence, above=0.5)
+    return cluster_interval(events, trials, 2 * confidence - 1)[1]
+
+
+def _design_effect(events: np.ndarray, trials: np.ndarray) -> float:
+    """Returns how many times greater the variance of the rate is than that of independent trials.
+
+    At least 1; the variance is that of a ratio of sums over clusters.
+    """
+    n, rate = trials.sum(), events.sum() / trials.sum()
+    alike = rate * (1 - rate) / n
+    if alike == 0:
+        return 1.0
+    g = len(trials)
+    seen = g / (g - 1) * np.sum(np.square(events - rate * trials)) / float(n) ** 2
+    return max(1.0, float(seen / alike))
+
+
+class Split(NamedTuple):
+    """Variances of a number that depends on two sources of chance, one drawn within the other."""
+
+    between: float  # variance due to the outer one, such as the threat fit; at least 0
+    within: float  # variance due to the inner one, such as the planner's seed
+    share: float  # of `between` in the sum of both; nan where both are 0
+
+
+def variance_split(groups: Sequence[Sequence[float]]) -> Split:
+    """Splits the variance of some values into that between groups and that within them.
+
+    One-way analysis of variance with random effects: unbiased but for the cut at 0.
+
+    Args:
+        groups: (f, s) values: at least two groups of at least two, of one size.
+
+    Raises:
+        ValueError: there are too few, or they differ in number.
+    """
+    sizes = {len(group) for group in groups}
+    if len(groups) < 2 or len(sizes) != 1 or min(sizes) < 2:
+        raise ValueError(
+            f"groups have {[len(group) for group in groups]} values; there must be at least 2 "
+            "groups of at least 2 values, all of one size"
+        )
+    values = np.asarray(groups, float)
+    size = values.shape[1]
+    within = float(np.mean(np.var(values, axis=1, ddof=1)))
+    between = max(0.0, float(np.var(values.mean(axis=1), ddof=1)) - within / size)
+    total = between + within
+    return Split(between, within, between / total if total > 0 else float("nan"))
 
 
 def _check_confidence(confidence: float) -> None:

@@ -7,10 +7,13 @@ from scipy import stats
 from rp_jax.statistics import (
     _trials,
     clopper_pearson,
+    cluster_interval,
+    cluster_upper_bound,
     events_allowed,
     mean_interval,
     plan_test,
     upper_bound,
+    variance_split,
 )
 
 rates = st.integers(1, 300).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
@@ -173,3 +176,94 @@ def test_the_most_events_that_a_bound_allows(n, rate, k):
     assert events_allowed(n, rate) == k
     if k >= 0:
         assert upper_bound(k, n, 0.95) <= rate < upper_bound(k + 1, n, 0.95)
+
+
+def test_the_interval_over_clusters_by_hand():
+    # Rates .1 and .3: variance of the mean .01, of 20 independent trials .2 * .8 / 20 = .008.
+    low, high = cluster_interval([1, 3], [10, 10])
+    independent = 20 / 1.25 * (stats.t.ppf(0.975, 19) / stats.t.ppf(0.975, 1)) ** 2
+    k = 0.2 * independent
+    np.testing.assert_allclose(low, stats.beta.ppf(0.025, k, independent - k + 1), rtol=1e-12)
+    np.testing.assert_allclose(high, stats.beta.ppf(0.975, k + 1, independent - k), rtol=1e-12)
+    assert cluster_upper_bound([1, 3], [10, 10], 0.975) == high
+
+
+def test_clusters_that_are_alike_are_no_better_than_independent_trials():
+    pooled = clopper_pearson(50, 1000)
+    low, high = cluster_interval([5] * 10, [100] * 10)
+    assert low < pooled[0] < pooled[1] < high
+    many = cluster_interval([1] * 1000, [20] * 1000)  # where nothing is lost for few clusters
+    np.testing.assert_allclose(many, clopper_pearson(1000, 20_000), rtol=2e-3)
+
+
+def test_clusters_at_the_ends_of_the_range():
+    assert cluster_interval([7], [10]) == (0.0, 1.0)  # one cluster says nothing of others
+    assert cluster_interval([0, 0], [10, 10])[0] == 0.0
+    assert cluster_interval([10, 10], [10, 10])[1] == 1.0
+    # No event in ten agents of 10,000 episodes: as many as (1.96 / 2.262)^2 = .751 of them show.
+    np.testing.assert_allclose(cluster_interval([0] * 10, [10_000] * 10)[1], 4.91e-5, rtol=2e-3)
+
+
+@pytest.mark.parametrize(("spread", "least"), [(0.0, 0.95), (0.5, 0.94), (1.0, 0.9)])
+@pytest.mark.parametrize("clusters", [3, 10])
+@pytest.mark.parametrize("mean", [0.1, 2, 100])
+def test_the_coverage_of_both_intervals_over_unlike_clusters(spread, least, clusters, mean):
+    """Rates of clusters are drawn from gamma distributions: what the intervals say is counted."""
+    rng, trials, rate = np.random.default_rng(0), 10_000, mean / 10_000
+    rates = np.full((400, clusters), rate)
+    if spread:
+        rates = np.minimum(rng.gamma(1 / spread**2, rate * spread**2, rates.shape), 1.0)
+    events = rng.binomial(trials, rates)
+    own = [clopper_pearson(int(k.sum()), clusters * trials) for k in events]
+    of_method = [cluster_interval(k, [trials] * clusters) for k in events]
+
+    def covers(found, truth):
+        return np.mean([a <= t <= b for (a, b), t in zip(found, truth, strict=True)])
+
+    assert covers(own, rates.mean(axis=1)) >= 0.93  # of these clusters, whatever their spread
+    assert covers(of_method, [rate] * 400) >= least - 0.02
+    if spread == 1.0 and mean == 100:
+        assert covers(own, [rate] * 400) < 0.3  # what pooled episodes do not say
+
+
+def test_where_no_cluster_has_an_event_the_bound_covers_unlike_clusters():
+    rng, covered = np.random.default_rng(1), []
+    for _ in range(2000):
+        rates = rng.gamma(1.0, 3e-5, 3)
+        events = rng.binomial(10_000, rates)
+        if events.sum() == 0:
+            covered.append(cluster_upper_bound(events, [10_000] * 3) >= 3e-5)
+    assert len(covered) > 500
+    assert np.mean(covered) >= 0.95
+
+
+@pytest.mark.parametrize(
+    ("events", "trials", "words"),
+    [
+        ([], [], "number of clusters is 0; it must be"),
+        ([1, 2], [10], "events has 2 clusters and trials 1"),
+        ([11, 2], [10, 10], "events is 11; it must be"),
+        ([0, 0], [10, 0], "trials is 0; it must be"),
+    ],
+)
+def test_clusters_that_make_no_sense_are_refused(events, trials, words):
+    with pytest.raises(ValueError, match=words):
+        cluster_interval(events, trials)
+
+
+def test_variance_is_split_between_groups_and_within_them_by_hand():
+    # Means 2 and 6 (variance 8); within each group variance 2.
+    found = variance_split([[1.0, 3.0], [5.0, 7.0]])
+    assert (found.within, found.between) == (2.0, 7.0)
+    assert found.share == pytest.approx(7 / 9)
+    assert variance_split([[1.0, 3.0], [3.0, 1.0]]).between == 0.0
+    with pytest.raises(ValueError, match=r"groups have \[2, 1\] values"):
+        variance_split([[1.0, 2.0], [3.0]])
+
+
+def test_variance_splits_are_unbiased():
+    rng = np.random.default_rng(2)
+    groups = rng.normal(0, 3.0, (4000, 4, 1)) + rng.normal(0, 1.0, (4000, 4, 3))
+    found = [variance_split(values) for values in groups]
+    assert np.mean([split.between for split in found]) == pytest.approx(9.0, rel=0.05)
+    assert np.mean([split.within for split in found]) == pytest.approx(1.0, rel=0.05)

@@ -165,7 +165,7 @@ def _ahead(of: dict[str, Any], env: str) -> list[Claim]:
                 f"Section 5.3, {env}: safer than 3-step MPC",
                 "lower crash rate",
                 f"RP {tables.percent(final[rp])} %, MPC {tables.percent(three)} %",
-                holds(final[rp]["crash_ci95"][1] < three["crash_ci95"][0]),
+                holds(tables.method_interval(final[rp])[1] < tables.method_interval(three)[0]),
             )
         )
     return claims

@@ -121,7 +121,7 @@ def line(env: str, row: Row) -> Row:
         "seeds": row["seeds"],
         "return": tables.earned(row),
         "crashes": tables.crashed(row),
-        "crash rate, % [95 %]": tables.percent(row),
+        **tables.rates(row),
     }
 
 
@@ -138,7 +138,9 @@ def errors(row: Row) -> Row:
 
 def shown(row: Row) -> str:
     """Return and crash rate in words."""
-    return f"{tables.earned(row)}; {tables.crashed(row)}: {tables.percent(row)} %"
+    method = tables.method_percent(row)
+    told = f"{tables.earned(row)}; {tables.crashed(row)}: {tables.percent(row)} %"
+    return f"{told}, of the method {method} %" if method else told
 
 
 def said(known: published.Score) -> str:
@@ -161,7 +163,7 @@ def table(
                 "seeds": row["seeds"],
                 "return": tables.earned(row),
                 "crashes": tables.crashed(row),
-                "crash rate, % [95 %]": tables.percent(row),
+                **tables.rates(row),
             }
             if paper:
                 known = paper.get(variant, {}).get(_plain(row["method"]))
@@ -239,7 +241,8 @@ def comparisons(
         ]
         if not others:
             continue
-        safer = [row["crash_ci95"][0] > rp[row["variant"]]["crash_ci95"][1] for row in others]
+        ours = {variant: tables.method_interval(row) for variant, row in rp.items()}
+        safer = [tables.method_interval(row)[0] > ours[row["variant"]][1] for row in others]
         least = min(others, key=lambda row: row["crash_rate"])
         found.append(
             Claim(
@@ -279,7 +282,8 @@ def goals(scores: Sequence[Row], env: str) -> Table:
         if not row["method"].startswith("RP") or variant not in published.GOALS[env]:
             continue
         bound, wanted = published.GOALS[env][variant], published.SCORES[env][variant]["RP"][0]
-        upper, mean = row["crash_upper95"], row["return_mean"]
+        upper = row["method_crash_upper95"] or row["crash_upper95"]
+        mean = row["return_mean"]
         lines.append(
             {
                 "variant": variant,
@@ -291,7 +295,8 @@ def goals(scores: Sequence[Row], env: str) -> Table:
                 "met": _met(mean - wanted, bound - upper),
             }
         )
-    return Table("Goals: return, and one-sided 95 % upper bound of the crash rate", lines)
+    title = "Goals: return, and one-sided 95 % upper bound of the method's crash rate"
+    return Table(title, lines)
 
 
 def _met(more_return: float, less_crashes: float) -> str:

@@ -43,7 +43,10 @@ def tell(results: dict[str, Any]) -> Section:
         f"crash rate below c = {published.LIMITS['jam']:g}",
         f"{scores.shown(rp)}; best without a shield: {best['return_mean']:.2f}, "
         f"{tables.percent(best)} %",
-        holds(rp["crash_ci95"][1] <= published.LIMITS["jam"] and scores.less_earned(best, rp)),
+        holds(
+            tables.method_interval(rp)[1] <= published.LIMITS["jam"]
+            and scores.less_earned(best, rp)
+        ),
     )
     return Section(
         "The agent earns 20 times the way made to one of two corners, 10 on arrival, and then "

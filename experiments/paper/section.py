@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from rp_jax.runs import tables
+
 EXCEEDED, REPRODUCED, MISSED = "exceeded", "reproduced", "not reproduced"
 HALF_A_DIGIT = 0.005  # published crash rates have two digits
 CLOSE = 0.02  # of the published return, by which a mean may fall short of it
@@ -47,11 +49,11 @@ def verdict_on_return(row: Mapping[str, Any], published: float) -> str:
 
 
 def verdict_on_crashes(row: Mapping[str, Any], published: float) -> str:
-    """By the whole 95 % interval: below the published rate, or not above it, as rounded.
+    """By the method's whole 95 % interval: below the published rate, or not above it, as rounded.
 
     Of one seed, it is not called below.
     """
-    upper = row["crash_ci95"][1]
+    upper = tables.method_interval(row)[1]
     if upper < published - HALF_A_DIGIT and row["seeds"] > 1:
         return EXCEEDED
     return REPRODUCED if upper <= published + HALF_A_DIGIT else MISSED

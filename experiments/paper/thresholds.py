@@ -54,7 +54,7 @@ def tell(results: list[dict[str, Any]]) -> Section:
             "x": f"{row['x']:g}",
             "seeds": row["seeds"],
             "return": tables.earned(row),
-            "crash rate, % [95 %]": tables.percent(row),
+            **tables.rates(row),
             "insecure states, %": f"{100 * row['insecure']:.2f}",
         }
         for row in results

@@ -1,5 +1,6 @@
 """Danger while learning: all methods, all tasks."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +40,22 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
                     "danger": sum(met) / max(1, episodes),
                     "crash_rate": crashes / max(1, episodes),
                     "crash_ci95": statistics.clopper_pearson(crashes, max(1, episodes)),
+                    "method_crash_ci95": _over_seeds(history),
                     "inadmissible": inadmissible if method.startswith("RP") else None,
                 }
             )
     return rows
+
+
+def _over_seeds(history: Sequence[Mapping[str, Any]]) -> tuple[float, float] | None:
+    """Returns the interval of the method's crash rate while learning; None of one seed."""
+    of = [[row for row in history if row["seed"] == s] for s in {row["seed"] for row in history}]
+    crashes, episodes = (
+        [sum(row.get(name, 0) for row in rows) for rows in of] for name in ("crashes", "episodes")
+    )
+    if len(of) == 1 or min(episodes) == 0:
+        return None
+    return statistics.cluster_interval(crashes, episodes)
 
 
 def tell(results: list[dict[str, Any]]) -> Section:
@@ -53,7 +66,7 @@ def tell(results: list[dict[str, Any]]) -> Section:
             "method": row["method"],
             "seeds": row["seeds"],
             "crashes": f"{row['crashes']:,} in {row['episodes']:,} episodes",
-            "rate, % [95 %]": tables.percent(row),
+            **tables.rates(row),
             "danger an episode": f"{row['danger']:.2g}",
             "inadmissible actions": "" if row["inadmissible"] is None else row["inadmissible"],
         }
@@ -64,7 +77,7 @@ def tell(results: list[dict[str, Any]]) -> Section:
             f"Section 1, {row['env']}, {row['method']}: the learning process is safe",
             f"danger of an episode below c = {published.LIMITS[row['env']]:g}",
             f"{row['danger']:.2g}; crashes in {tables.crashed(row)} episodes: "
-            f"{tables.percent(row)} %",
+            f"{tables.percent(row)} %, of the method {tables.method_percent(row)} %",
             holds(_keeps(row)),
         )
         for row in results
@@ -80,5 +93,5 @@ def tell(results: list[dict[str, Any]]) -> Section:
 
 def _keeps(row: dict[str, Any]) -> bool:
     """Whether c is kept: by the whole interval, or, where danger is no probability, the mean."""
-    found = row["danger"] if row["env"] in GOES_ON else row["crash_ci95"][1]
+    found = row["danger"] if row["env"] in GOES_ON else tables.method_interval(row)[1]
     return bool(found <= published.LIMITS[row["env"]])

@@ -88,7 +88,7 @@ def show(name: str, rows: Sequence[dict[str, Any]]) -> None:
                 "x": f"{row['x']:g}",
                 "return": tables.earned(row),
                 "crashes": tables.crashed(row),
-                "crash rate, % [95 %]": tables.percent(row),
+                **tables.rates(row),
                 "no admissible action, % of steps": f"{100 * row['insecure']:.3f}",
             }
             for row in rows

@@ -38,7 +38,7 @@ def show_table(table: tables.Table) -> None:
                 "case": row["variant"],
                 "return over agents": tables.earned(row),
                 "crashes": tables.crashed(row),
-                "crash rate, % [95 %]": tables.percent(row),
+                **tables.rates(row),
             }
             for row in table.summary
         ]

@@ -84,7 +84,8 @@ def show(name: str, rows: Sequence[Mapping[str, Any]]) -> None:
             "method": row["method"],
             "return": tables.earned(row),
             "crashes": tables.crashed(row),
-            "crash rate, % [95 %]": tables.percent(row),
+            **tables.rates(row),
+            "hit": tables.hits(row["collisions"]),
             "goal": f"{row['goal_rate']:.3f}",
         }
         for row in rows

@@ -16,7 +16,7 @@ from rp_jax.runs.agents import Agents
 from rp_jax.runs.evaluate import evaluate
 from rp_jax.runs.plan import make_pmdp, plan
 from rp_jax.runs.progress import OnMetrics, OnProgress, silent
-from rp_jax.runs.tables import Table, aligned, crashed, earned, hits, over_seeds, percent
+from rp_jax.runs.tables import Table, aligned, crashed, earned, hits, over_seeds, rates
 from rp_jax.streams import Stream, key_of, numbered
 from rp_jax.threat.function import ThreatFunction
 from rp_jax.validate import number
@@ -35,7 +35,7 @@ class ShieldTable(Table):
                     "agent": str(row["seed"]),
                     "return": earned(row),
                     "crashes": crashed(row),
-                    "crash rate, % [95 %]": percent(row),
+                    **rates(row),
                     "hit": hits(row["collisions"]),
                     "goal": f"{row['goal_rate']:.3f}",
                 }

@@ -73,7 +73,8 @@ def evaluate(
     job = {} if where is None else {**spec_of(key, several), "episodes": episodes}
     with record.job(where, stage, job) as checkpoints:
         rows = play_all(key, pmdp, players, episodes, stage, devices, on_progress, checkpoints)
-    about = {"env": record.short_name(pmdp.env), "variant": name}
+    checksum = "" if several.threat is None else several.threat.checksum[:12]
+    about = {"env": record.short_name(pmdp.env), "variant": name, "threat": checksum}
     return Table(scored(rows, pmdp, players, penalty, about))
 
 

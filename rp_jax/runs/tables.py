@@ -23,6 +23,7 @@ COLUMNS = [
     "crashes",
     "crash_rate",
     "crash_upper95",
+    "threat",
     "danger_mean",
     "goal_rate",
     "interventions",
@@ -30,6 +31,8 @@ COLUMNS = [
     "seconds_per_100_actions",
     "train_seconds",
 ]
+RATE = "crash rate, % [95 %, these agents]"
+METHOD_RATE = "[95 %, other seeds]"
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,7 @@ def _line(row: Mapping[str, Any]) -> dict[str, str]:
         "agent": str(row.get("seed", "")),
         "return": earned(row),
         "crashes": crashed(row),
-        "crash rate, % [95 %]": percent(row),
+        **rates(row),
     }
     if "goal_rate" in row:
         found["goal"] = f"{row['goal_rate']:.3f}"
@@ -166,6 +169,38 @@ def percent(row: Mapping[str, Any]) -> str:
     return f"{100 * row['crash_rate']:.3f} [{low:.3f}, {high:.3f}]"
 
 
+def rates(row: Mapping[str, Any]) -> dict[str, str]:
+    """Returns the crash rate with its two intervals, in per cent, by the names of their columns.
+
+    Args:
+        row: with crash_rate and crash_ci95, perhaps with method_crash_ci95.
+    """
+    own = {RATE: percent(row)}
+    return own | {METHOD_RATE: method_percent(row)} if "method_crash_ci95" in row else own
+
+
+def method_interval(row: Mapping[str, Any]) -> tuple[float, float]:
+    """Returns the interval of the method's crash rate; that of the agent where there is but one.
+
+    Args:
+        row: with crash_ci95, perhaps with method_crash_ci95.
+    """
+    low, high = row.get("method_crash_ci95") or row["crash_ci95"]
+    return float(low), float(high)
+
+
+def method_percent(row: Mapping[str, Any]) -> str:
+    """Returns the interval of the method's crash rate in per cent; empty for one agent.
+
+    Args:
+        row: perhaps with method_crash_ci95, from `over_seeds`.
+    """
+    if not row.get("method_crash_ci95"):
+        return ""
+    low, high = (100 * bound for bound in row["method_crash_ci95"])
+    return f"[{low:.3f}, {high:.3f}]"
+
+
 def earned(row: Mapping[str, Any]) -> str:
     """Returns the return and the half-width of its 95 % interval, in words.
 
@@ -185,11 +220,13 @@ def crashed(row: Mapping[str, Any]) -> str:
 
 
 def over_seeds(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Returns, per variant, the mean of the agents' returns and all their crashes pooled.
+    """Returns, per variant, the mean return and the crash rate of all agents, with two intervals.
 
-    The interval of returns is that of the mean over seeds; of one seed alone, over its episodes.
-    That of the crash rate is of all episodes as if one agent had played them: it is exact for
-    these agents together, and does not say how another seed would do.
+    `crash_ci95` and `crash_upper95` pool all episodes as if one agent had played them: exact for
+    these agents together, and silent on how another seed would do. `method_crash_ci95` and
+    `method_crash_upper95` speak of the method: of agents from other seeds, and from other threat
+    functions if the rows have several (`statistics.cluster_interval`; None for one agent). The
+    interval of returns is over the same clusters; of one agent alone, over its episodes.
 
     Args:
         rows: of one method, per variant and agent.
@@ -197,13 +234,21 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     found = []
     for variant in dict.fromkeys(row["variant"] for row in rows):
         of = [row for row in rows if row["variant"] == variant]
-        mean, width = statistics.mean_interval(np.asarray([row["return_mean"] for row in of]))
+        threats = clusters_of(of)
+        clusters = threats if len(threats) > 1 else [[row] for row in of]
+        returns = [float(np.mean([r["return_mean"] for r in cluster])) for cluster in clusters]
+        mean, width = statistics.mean_interval(np.asarray(returns))
         width = width if len(of) > 1 else of[0]["return_ci95"]
-        n, k = sum(r["episodes"] for r in of), sum(r["crashes"] for r in of)
+        crashes = [sum(r["crashes"] for r in cluster) for cluster in clusters]
+        episodes = [sum(r["episodes"] for r in cluster) for cluster in clusters]
+        n, k, several = sum(episodes), sum(crashes), len(of) > 1
+        interval = list(statistics.cluster_interval(crashes, episodes)) if several else None
+        bound = statistics.cluster_upper_bound(crashes, episodes) if several else None
         found.append(
             {
                 "variant": variant,
-                "seeds": len(of),
+                "seeds": len(of) // max(1, len(threats)),
+                "threats": len(threats),
                 "return_mean": mean,
                 "return_ci95": width,
                 "crashes": k,
@@ -211,6 +256,44 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 "crash_rate": k / n,
                 "crash_ci95": list(statistics.clopper_pearson(k, n)),
                 "crash_upper95": statistics.upper_bound(k, n),
+                "method_crash_ci95": interval,
+                "method_crash_upper95": bound,
             }
         )
     return found
+
+
+def clusters_of(rows: Sequence[Mapping[str, Any]]) -> list[list[Mapping[str, Any]]]:
+    """Returns rows by the threat function of their agents; those without one are one cluster.
+
+    Args:
+        rows: perhaps with `threat`, the beginning of the checksum of the threat function.
+    """
+    found: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        found.setdefault(row.get("threat", ""), []).append(row)
+    return list(found.values())
+
+
+def split_chance(rows: Sequence[Mapping[str, Any]]) -> dict[str, statistics.Split]:
+    """Splits the variance between agents into that of threat functions and that of the planner.
+
+    The planner's part holds the chance of the episodes too. Crash rates are compared as logits of
+    (crashes + .5) / (episodes + 1).
+
+    Args:
+        rows: of one method and variant, as many agents for each of several threat functions.
+
+    Returns:
+        Of "return" and "logit of the crash rate".
+
+    Raises:
+        ValueError: there are fewer than two threat functions, or two agents of each.
+    """
+    rates = lambda row: (row["crashes"] + 0.5) / (row["episodes"] + 1)  # noqa: E731
+    clusters = clusters_of(rows)
+    logits = [[float(np.log(rates(r) / (1 - rates(r)))) for r in of] for of in clusters]
+    return {
+        "return": statistics.variance_split([[r["return_mean"] for r in of] for of in clusters]),
+        "logit of the crash rate": statistics.variance_split(logits),
+    }

@@ -1,5 +1,6 @@
 import pytest
 
+from rp_jax import statistics
 from rp_jax.runs import tables
 
 
@@ -13,8 +14,41 @@ def test_seeds_are_summed_up_by_hand():
     assert both["return_ci95"] == pytest.approx(12.7062, rel=1e-4)  # t(.975, 1) x 1
     assert (both["crashes"], both["episodes"], both["crash_rate"]) == (1, 20, 0.05)
     assert both["crash_ci95"][0] < 0.05 < both["crash_upper95"] < both["crash_ci95"][1]
+    assert both["method_crash_ci95"][1] > both["crash_ci95"][1]
+    assert both["method_crash_upper95"] < both["method_crash_ci95"][1]
+    assert (both["threats"], single["method_crash_ci95"]) == (1, None)
     assert (single["variant"], single["seeds"]) == ("b", 1)
     assert single["return_ci95"] == 0.5  # over its episodes
+
+
+def test_agents_of_several_threat_functions_are_clusters():
+    row = {"variant": "a", "episodes": 1000, "return_ci95": 0.5}
+    agents = [("x", 1.0, 2), ("x", 2.0, 4), ("y", 5.0, 10), ("y", 6.0, 8)]
+    rows = [
+        {**row, "threat": threat, "seed": i, "return_mean": mean, "crashes": crashes}
+        for i, (threat, mean, crashes) in enumerate(agents)
+    ]
+    (found,) = tables.over_seeds(rows)
+    assert (found["threats"], found["seeds"], found["crashes"]) == (2, 2, 24)
+    assert found["return_ci95"] == pytest.approx(12.7062 * 2, rel=1e-4)  # of 1.5 and 5.5
+    wanted = statistics.cluster_interval([6, 18], [2000, 2000])
+    assert found["method_crash_ci95"] == list(wanted)
+    split = tables.split_chance(rows)
+    assert (split["return"].within, split["return"].between) == (0.5, 7.75)
+    assert split["logit of the crash rate"].share > 0.5
+    with pytest.raises(ValueError, match="at least 2 groups"):
+        tables.split_chance(rows[:2])
+
+
+def test_both_intervals_are_told_apart():
+    row = {"crash_rate": 0.01, "crash_ci95": (0.005, 0.02), "method_crash_ci95": (0.0, 0.05)}
+    assert tables.rates(row) == {
+        tables.RATE: "1.000 [0.500, 2.000]",
+        tables.METHOD_RATE: "[0.000, 5.000]",
+    }
+    assert tables.rates({**row, "method_crash_ci95": None})[tables.METHOD_RATE] == ""
+    assert tables.method_interval(row) == (0.0, 0.05)
+    assert tables.method_interval({"crash_ci95": (0.005, 0.02)}) == (0.005, 0.02)
 
 
 def test_a_row_is_told_in_words():
