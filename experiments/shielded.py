@@ -112,7 +112,9 @@ class BraxWorld(NamedTuple):
         """Returns the observations of states (B,)."""
         return states.obs
 
-    def advance(self, keys: Any, states: Any, actions: Any) -> tuple[Any, Outcome]:
+    def advance(
+        self, keys: Any, states: Any, actions: Any, percept: Any
+    ) -> tuple[Any, Outcome]:
         """Makes one transition of each state (B,), whose random keys are its own."""
         reached = self.env.step(states, actions)
         return reached, Outcome(
@@ -157,6 +159,7 @@ def played(
             length=step.moved,
             interventions=told.get("intervention", no) > 0,
             insecure=told.get("insecure", no) > 0,
+            booked=no.astype(float),
             collisions=jax.vmap(hits, (0, None))(states, params),
             bad_observations=not_finite(step.percept),
             bad_threats=no,  # the shield's own

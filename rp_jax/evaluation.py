@@ -29,6 +29,7 @@ class Episodes(NamedTuple):
     length: Array  # steps
     interventions: Array  # steps on which the mask changed the policy's own choice
     insecure: Array  # steps without an admissible action
+    booked: Array  # danger booked, where episodes have a budget; else 0
     collisions: dict[str, Array]  # bool, what was hit
     bad_observations: Array  # steps on which a number was nan or infinite
     bad_threats: Array  # likewise
@@ -158,6 +159,7 @@ def counting(env: Env, params: Any) -> Callable[[Episodes, Step], Episodes]:
             length=step.moved,
             interventions=step.changed,
             insecure=~step.percept.secure,
+            booked=booked(env, step),
             collisions=jax.vmap(hits, (0, None))(step.reached, params),
             bad_observations=bad_observation,
             bad_threats=bad_threat,
@@ -165,6 +167,18 @@ def counting(env: Env, params: Any) -> Callable[[Episodes, Step], Episodes]:
         return added(rows, new, step.moved)
 
     return fold
+
+
+def booked(env: Env, step: Step) -> Array:
+    """Returns the danger that a step was booked with, (B,); 0 where there are no budgets.
+
+    Args:
+        env: the environment.
+        step: of all episodes.
+    """
+    if not optional.has_budget(env):
+        return jnp.zeros_like(step.outcome.danger)
+    return step.reached.booked - step.states.booked
 
 
 def no_episodes(env: Env, states: Any, params: Any) -> Episodes:
@@ -180,7 +194,7 @@ def no_episodes(env: Env, states: Any, params: Any) -> Episodes:
     hits = functools.partial(optional.collisions, env)
     kinds = jax.eval_shape(jax.vmap(hits, (0, None)), states, params)
     collisions = dict.fromkeys(kinds, none)
-    return Episodes(zero, zero, none, count, count, count, collisions, count, count)
+    return Episodes(zero, zero, none, count, count, count, zero, collisions, count, count)
 
 
 def added(rows: Episodes, step: Episodes, moved: Array) -> Episodes:

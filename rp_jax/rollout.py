@@ -28,13 +28,16 @@ class Playable(Protocol):
             alive: (B,) bool; the other rows need not be right.
         """
 
-    def advance(self, keys: Array, states: Any, actions: Array) -> tuple[Any, Outcome]:
+    def advance(
+        self, keys: Array, states: Any, actions: Array, percept: Any
+    ) -> tuple[Any, Outcome]:
         """Makes one transition of each state.
 
         Args:
             keys: (B,).
             states: leading axis (B,).
             actions: (B,) or (B, D).
+            percept: of the states.
 
         Returns:
             The states after, and the outcomes of the step.
@@ -96,7 +99,7 @@ def rollout(
         moved = alive if stop is None else alive & ~stop(time, percept)
         action, changed = policy(jax.random.fold_in(act_key, time), percept)
         now = jax.vmap(jax.random.fold_in, (0, None))(keys, time)
-        reached, outcome = world.advance(now, states, action)
+        reached, outcome = world.advance(now, states, action, percept)
         step = Step(time, alive, moved, states, percept, action, changed, reached, outcome)
         kept = jax.vmap(select)(moved, reached, states)
         return time + 1, moved, moved & ~over(outcome), kept, fold(carry, step)

@@ -1,8 +1,11 @@
 """Every use of random numbers has a stream of its own: no two uses of one key share a draw."""
 
 import enum
+from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 
@@ -23,6 +26,13 @@ class Stream(enum.IntEnum):
     POLICY_GRADIENT = 11  # learning of the policies of baselines
     SEARCH = 12  # episodes of tree search
     TIMING = 13  # episodes in which decisions are timed
+    LOOKAHEAD = 14  # outcomes of actions by which a state's threats are lowered
+    LOOKAHEAD_AGAIN = 15  # fresh outcomes of the actions that this alone would admit
+    ACCOUNT = 16  # outcomes of a chosen action by which its danger is booked
+    LOTS = 17  # choices among equally good actions of a search
+
+
+STATES = 0x100C  # seed of the keys that follow from a state alone
 
 
 def key_of(key: Array, stream: Stream) -> Array:
@@ -33,6 +43,32 @@ def key_of(key: Array, stream: Stream) -> Array:
         stream: the use.
     """
     return jax.random.fold_in(key, int(stream))
+
+
+def key_of_state(state: Any, stream: Stream) -> Array:
+    """Returns a key that follows from a state alone: equal states have one, others do not.
+
+    So a choice may depend on chance and be a function of the state still, with draws that no two
+    states, episodes or seeds share.
+
+    Args:
+        state: a pytree of arrays, unbatched.
+        stream: the use; each has keys of its own.
+    """
+    words = jnp.concatenate([_words(leaf) for leaf in jax.tree.leaves(state)])
+    odd = np.random.default_rng(STATES).integers(2**31, size=words.size, dtype=np.uint32) * 2 + 1
+    mixed = words ^ (words >> 15)
+    digest = jnp.sum(mixed * jnp.asarray(odd, jnp.uint32), dtype=jnp.uint32)
+    return jax.random.fold_in(key_of(jax.random.key(STATES), stream), digest)
+
+
+def _words(leaf: Array) -> Array:
+    """Returns the bits of an array as numbers of 32 bits, (n,) uint32."""
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        leaf = jax.random.key_data(leaf)
+    if leaf.dtype == bool or leaf.dtype.itemsize < 4:
+        leaf = leaf.astype(jnp.float32 if jnp.issubdtype(leaf.dtype, jnp.floating) else jnp.int32)
+    return jax.lax.bitcast_convert_type(leaf, jnp.uint32).reshape(-1)
 
 
 def numbered(key: Array, numbers: list[int]) -> Array:

@@ -47,7 +47,7 @@ def blank(world, states, action=int):
     def first():
         percept = world.perceive(states)
         keys = jax.random.split(jax.random.key(0), count)
-        reached, outcome = world.advance(keys, states, actions)
+        reached, outcome = world.advance(keys, states, actions, percept)
         time = jnp.asarray(0)
         return Step(time, flags, flags, states, percept, actions, flags, reached, outcome)
 
@@ -182,7 +182,7 @@ class Count:
         assert alive is not None
         return View(states["number"], alive)
 
-    def advance(self, keys, states, actions):
+    def advance(self, keys, states, actions, percept):
         number = states["number"] + actions
         no = jnp.zeros(number.shape, bool)
         outcome = Outcome(number.astype(float), jnp.zeros(number.shape), number >= 10, no, no)

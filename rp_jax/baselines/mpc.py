@@ -19,12 +19,13 @@ from rp_jax.envs.contract import Env
 from rp_jax.hazards import is_static
 from rp_jax.planning.percept import Percept
 from rp_jax.planning.pmdp import PMDP
+from rp_jax.shield import rounded_down
+from rp_jax.streams import STATES, Stream, key_of
 from rp_jax.validate import number, shown
 
 UNSAFE = 1e4  # subtracted above the limit of danger; more than any reward within a horizon
 SAME = 1e-4  # scores that differ by less are equal up to rounding
 CHUNK = 16  # number of sequences of first actions tried at a time
-LOTS = 0x107  # seed for the choice among equally good actions
 
 
 class Model(Env, Protocol):
@@ -103,7 +104,7 @@ def make_search(
     return Search(
         params=params,
         penalty=jnp.asarray(penalty, float),
-        limit=jnp.asarray(limit, float),
+        limit=jnp.asarray(rounded_down(limit), float),
         model=model,
         horizon=horizon,
     )
@@ -359,7 +360,7 @@ def drawn(state: Any, scores: Array) -> Array:
         for others.
     """
     place = jax.lax.bitcast_convert_type(state.body.position.astype(jnp.float32), jnp.uint32)
-    key = jax.random.key(LOTS)
+    key = key_of(jax.random.key(STATES), Stream.LOTS)
     for part in (state.time, *place):
         key = jax.random.fold_in(key, part)
     lots = jax.random.uniform(key, scores.shape, scores.dtype, minval=0.5)

@@ -19,6 +19,7 @@ def step_and_renew(
     look: Callable[[Any], Any],
     *,
     restart: Array | None = None,
+    advance: Callable[[Array, Any, Array], tuple[Any, Outcome]] | None = None,
 ) -> tuple[tuple[Any, Any], tuple[Any, Any], Outcome]:
     """Makes a step of a batch, restarts ended episodes, and looks at all states.
 
@@ -31,6 +32,7 @@ def step_and_renew(
         actions: (B,) int, or (B, D) float where they are continuous.
         params: the environment's parameters, unbatched.
         look: maps a batch of states, of any size, to a pytree with a row for each.
+        advance: makes a step of the batch from (keys, states, actions); by default `env.step` does.
         restart: () bool, whether all episodes end with this step, whatever it leads to.
 
     Returns:
@@ -39,8 +41,10 @@ def step_and_renew(
         led to, terminal ones included, and what `look` says of them.
     """
     both = jax.vmap(jax.random.split)(keys)
-    step = jax.vmap(env.step, (0, 0, 0, None))
-    reached, outcome = step(both[:, 0], states, actions, params)
+    if advance is None:
+        reached, outcome = jax.vmap(env.step, (0, 0, 0, None))(both[:, 0], states, actions, params)
+    else:
+        reached, outcome = advance(both[:, 0], states, actions)
     if restart is not None:
         terminated, truncated = outcome.terminated | restart, outcome.truncated & ~restart
         outcome = outcome.replace(terminated=terminated, truncated=truncated)

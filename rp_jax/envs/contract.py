@@ -63,7 +63,8 @@ class Env(Protocol):
         clearance(position, params)   () distance left between `position` (2,) and the nearest fixed
                                       hazard, or a lower bound of it. With it `Plans` take all fixed
                                       hazards together, and a world under `Plans` has to have it
-        threshold(state)              () greatest admissible threat in the state; by default the
+        threshold(state, x, least)    () greatest admissible threat in the state, whose least threat
+                                      is `least`; by default the
                                       P-MDP's x
         LIDAR_BINS                    how many of an observation's first values are distances of a
                                       LIDAR, a multiple of 8; 0 by default

@@ -50,15 +50,38 @@ def clearance(env: Env, position: Array, params: Any) -> Array:
     return jnp.full((), jnp.inf, position.dtype)
 
 
-def threshold(env: Env, state: Any, x: Array) -> Array:
+def threshold(env: Env, state: Any, x: Array, least: Array) -> Array:
     """Returns the largest admissible threat in a state, ().
 
     Args:
         env: the environment.
         state: the state, unbatched.
         x: () the threshold of environments that do not say.
+        least: () the least threat of any action.
     """
-    return env.threshold(state) if hasattr(env, "threshold") else jnp.asarray(x)
+    return env.threshold(state, x, least) if hasattr(env, "threshold") else jnp.asarray(x)
+
+
+def lookahead_above(env: Env, state: Any, x: Array) -> Array:
+    """Returns the threat above which outcomes of actions are looked at, if every action has more.
+
+    Args:
+        env: the environment; by default it is the threshold.
+        state: the state, unbatched.
+        x: () the threshold of environments that do not say.
+    """
+    if hasattr(env, "lookahead_above"):
+        return env.lookahead_above(state, x)
+    return threshold(env, state, x, jnp.zeros_like(x))
+
+
+def has_budget(env: Env) -> bool:
+    """Returns whether states carry a budget of danger, which steps have to settle.
+
+    Args:
+        env: the environment.
+    """
+    return hasattr(env, "settle")
 
 
 def mixed_start(env: Env, key: Array, start: Any, fresh: Any) -> Any:

@@ -224,6 +224,7 @@ def interact(
         pmdp.params,
         pmdp.perceive,
         restart=starting,
+        advance=lambda keys, states, action: pmdp.advance(keys, states, action, state.seen),
     )
     insecure = ~seen.secure & ~outcome.terminated
     reward = outcome.reward - pmdp.penalty * outcome.danger - pmdp.insecure_penalty * insecure
@@ -290,8 +291,8 @@ def begin(key: Array, pmdp: PMDP, config: LoopConfig) -> LoopState:
         return states, pmdp.perceive(states)
 
     states, seen = jax.tree.map(zeros_like, jax.eval_shape(starts, key))
-    encoded, admissible, _, threat, _ = seen
-    zeros = jnp.zeros(batch, threat.dtype)
+    encoded, admissible = seen.encoded, seen.admissible
+    zeros = jnp.zeros(batch, seen.threat.dtype)
     false = jnp.zeros(batch, bool)
     taken = WindowStep(
         encoded, jnp.zeros(batch, jnp.int32), zeros, false, false, encoded, admissible

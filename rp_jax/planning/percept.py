@@ -22,6 +22,7 @@ class Percept(NamedTuple):
     secure: Array  # (B,) bool, some action's threat is at most the threshold
     threat: Array  # (B, A) threats of the actions
     threshold: Array  # (B,) largest admissible threat
+    summed: Array | None = None  # (B, A) threats before any look ahead; None where it is not known
 
 
 def encode(observation: Array, scan: int, pool: int) -> Encoded:

@@ -15,13 +15,14 @@ from rp_jax.envs import optional
 from rp_jax.envs.check import check_contract
 from rp_jax.envs.contract import Env
 from rp_jax.evaluation import action_values, shielded
+from rp_jax.planning.budgeted import Budgeted, unwrapped, with_budget
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.planning.percept import Percept
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.runs.record import short_name
 from rp_jax.shield import rounded_down
 from rp_jax.threat.function import ThreatFunction
-from rp_jax.validate import shown
+from rp_jax.validate import number, shown
 
 
 class Member(NamedTuple):
@@ -124,23 +125,44 @@ class Agents(Sequence[Agent]):
         weights = jax.tree.map(lambda a: a[index], self.weights)
         return Agent(with_member(self.pmdp, member), weights, self.network)
 
-    def in_world(self, env: Env | None = None, params: Any = None) -> "Agents":
-        """Returns the agents in another world, or in theirs with other parameters.
+    @property
+    def promised(self) -> tuple[float, float] | None:
+        """Least and greatest danger of an episode that is promised; None without a budget."""
+        if not isinstance(self.pmdp.env, Budgeted):
+            return None
+        return float(self.pmdp.params.low), float(self.pmdp.params.high)
+
+    def in_world(
+        self, env: Env | None = None, params: Any = None, c: float | None = None
+    ) -> "Agents":
+        """Returns the agents in another world, in theirs with other parameters, or promising c.
 
         Args:
             env: the world; theirs by default.
             params: its parameters; those that they learned with by default.
+            c: the danger that an episode may have, for agents that learned with such a budget;
+                what they learned with by default.
 
         Raises:
             ValueError: they cannot act there: something is seen or done otherwise, or the threats
-                hold for another body, baseline policy or hazard.
+                hold for another body, baseline policy or hazard; or they know no budget.
         """
-        pmdp = self.pmdp
-        if env is None and params is None:
+        pmdp, promised = self.pmdp, self.promised
+        if env is None and params is None and c is None:
             return self
+        if c is not None:
+            number("c", c, above=0)
+            if promised is None:
+                raise ValueError(f"c is {c:g}, but these agents learned without; see plan(c=...)")
         there = pmdp.replace(
             env=pmdp.env if env is None else env, params=pmdp.params if params is None else params
         )
+        if promised is not None:
+            inner, found = unwrapped(there.env, there.params)
+            env_there, params_there = with_budget(
+                inner, found, *(promised if c is None else (c, c))
+            )
+            there = there.replace(env=env_there, params=params_there)
         check_contract(there.env, there.params)
         check_same_interface((pmdp.env, pmdp.params), (there.env, there.params))
         if self.threat is not None:
@@ -207,9 +229,14 @@ def method_name(pmdp: PMDP, member: Member) -> str:
         pmdp: what it learned in.
         member: the agent.
     """
-    penalty = member.learning_penalty
-    if not pmdp.shielded or member.x == float("inf"):
+    penalty, budget = member.learning_penalty, isinstance(pmdp.env, Budgeted)
+    if not pmdp.shielded or (member.x == float("inf") and not budget):
         return f"DQN (penalty {penalty:g})"
     plans = ", plans" if isinstance(pmdp.params.body.baseline, Plans) else ""
+    if isinstance(pmdp.env, Budgeted):
+        low, high = float(pmdp.params.low), float(pmdp.params.high)
+        told = f"c={low:.4g}" if low == high else f"c={low:.4g} to {high:.4g}"
+        cap = "" if member.x == float("inf") else f", x={member.x:g}"
+        return f"RP{plans} ({told}{cap})"
     extra = "" if penalty == 0 else f", {penalty:g}"
     return f"RP{plans} (x={member.x:g}{extra})"

@@ -12,8 +12,9 @@ from flax import linen as nn
 from jax import Array
 
 from rp_jax import devices as sharing
-from rp_jax import evaluation
+from rp_jax import evaluation, statistics
 from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
+from rp_jax.envs import optional
 from rp_jax.envs.contract import Env
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.rollout import Policy
@@ -33,6 +34,7 @@ def evaluate(
     env: Env | None = None,
     params: Any = None,
     *,
+    c: float | None = None,
     episodes: int = 10_000,
     penalty: float = 0.0,
     name: str = "",
@@ -47,6 +49,8 @@ def evaluate(
         agents: as `plan` or `load` returns them.
         env: the world; by default that of the agents.
         params: its parameters; by default those that were learned with.
+        c: the danger that an episode may have, for agents that carry a budget; by default what
+            they learned with.
         episodes: of each agent.
         penalty: taken off the returns per unit of danger.
         name: of this world or these parameters, for the table.
@@ -55,7 +59,8 @@ def evaluate(
         on_progress: called with (stage, done, total, note).
 
     Returns:
-        A row per agent: returns with 95 % intervals, crashes with exact ones.
+        A row per agent: returns with 95 % intervals, crashes with exact ones. Where danger was
+        promised, `promised`, and `booked_mean`, the danger of an episode by the agent's account.
 
     Raises:
         ValueError: a setting is out of range, or the agents cannot act in this world.
@@ -65,7 +70,7 @@ def evaluate(
     number("episodes", episodes, least=1, integer=True)
     number("penalty", penalty, least=0)
     one_of("devices", devices, sharing.DEVICES)
-    several = checked_agents(agents).in_world(env, params)
+    several = checked_agents(agents).in_world(env, params, c)
     pmdp = several.pmdp
     players = Players(several.members, several.methods, greedily(several.network), several.weights)
     stage = f"evaluation {name}".strip()
@@ -209,10 +214,23 @@ def scored(
     found = []
     for i, member in enumerate(players.members):
         of = evaluation.summarise(jax.tree.map(lambda a, i=i: a[i], rows), penalty)
+        if optional.has_budget(pmdp.env):
+            of |= account(jax.tree.map(lambda a, i=i: a[i], rows), pmdp.params)
         x = member.x if pmdp.shielded else float("inf")
         who = {"method": players.names[i], "x": x, "seed": member.seed}
         found.append({**about, **who, **of})
     return found
+
+
+def account(rows: evaluation.Episodes, params: Any) -> dict[str, Any]:
+    """Returns what episodes with a budget spent by their own account.
+
+    Args:
+        rows: arrays (n,).
+        params: of the world, with the range of c.
+    """
+    booked, width = statistics.mean_interval(np.asarray(rows.booked))
+    return {"promised": float(params.high), "booked_mean": booked, "booked_ci95": width}
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from jax import Array
 from rp_jax.envs.contract import Env
 from rp_jax.planning import conditioned
 from rp_jax.planning.loop import LoopConfig
+from rp_jax.planning.wrapped import ranged
 from rp_jax.runs import tables
 from rp_jax.runs.evaluate import evaluate
 from rp_jax.runs.plan import plan
@@ -112,11 +113,11 @@ def frontier(
         for row in evaluate(key, agents, env, given, name=name, folder=place("separate"), **judged)
     ]
     whole = conditioned.Conditioned(env)
-    spread = conditioned.make_params(params, thresholds[0], thresholds[-1])
+    spread = ranged(params, thresholds[0], thresholds[-1])
     agents = plan(key, whole, spread, threat, x=thresholds[-1], folder=place("told"), **common)
     for name, given in tests.items():
         for x in thresholds:
-            fixed = conditioned.make_params(given, x, x)
+            fixed = ranged(given, x, x)
             label = f"{name} x={x:g}"
             found = evaluate(key, agents, whole, fixed, name=label, folder=place("told"), **judged)
             rows += [{"planner": TOLD, **row, "variant": name, "x": x} for row in found]

@@ -18,7 +18,7 @@ from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints, equal_chunks
 from rp_jax.envs import optional
 from rp_jax.envs.check import check_contract
 from rp_jax.envs.contract import Env
-from rp_jax.planning import loop
+from rp_jax.planning import budgeted, loop
 from rp_jax.planning.loop import LoopConfig, LoopState
 from rp_jax.planning.networks import POOLS
 from rp_jax.planning.pmdp import PMDP
@@ -40,10 +40,12 @@ def plan(
     params: Any,
     threat: ThreatFunction | None = None,
     *,
-    x: Several = 0.01,
+    c: float | Sequence[float] | None = None,
+    x: Several | None = None,
     seeds: int | Sequence[int] = 1,
     config: LoopConfig | None = None,
     lookahead: int = 0,
+    refunds: int = 8,
     learning_penalty: Several = 0.0,
     learning_penalty_from: float | None = None,
     insecure_penalty: float = 0.0,
@@ -65,9 +67,15 @@ def plan(
         params: its parameters while learning.
         threat: what `reconnoitre` returned, for a world with the same body and hazards; None: no
             action is forbidden.
-        x: largest admissible threat, or several.
+        c: the danger that an episode may have, or the least and the greatest that one agent is to
+            serve: then each episode of learning draws its own, and `evaluate` may ask for any. The
+            agent carries a budget and keeps c while it learns, too (docs/budgets.md).
+        x: largest admissible threat of each single step, or several: the paper's rule where no c is
+            given, .01 by default; beside c, a cap, and none by default.
         seeds: how many agents, or their numbers.
         config: of the learner; tuned settings by default.
+        refunds: outcomes of the action taken by which its danger is booked, where there is a c; 0:
+            its threat is booked, which is more, so that less of c is used.
         lookahead: outcomes of each action that are looked at where no action is admissible by the
             threats of the state alone; 0: none.
         learning_penalty: taken off the reward per unit of danger while learning, or several.
@@ -95,7 +103,8 @@ def plan(
         raise ValueError(f"config is {shown(config)}; it must be a LoopConfig")
     config.validate("config")
     one_of("devices", devices, sharing.DEVICES)
-    members = members_of(x, learning_penalty, seeds)
+    promised = promised_of(c, x, threat)
+    members = members_of(caps_of(c, x), learning_penalty, seeds)
     mesh = sharing.mesh_of(devices)
     sharing.divides("agents", len(members), mesh)
     if learning_penalty_from is not None:
@@ -112,12 +121,16 @@ def plan(
         lookahead=lookahead,
         config=config,
     )
+    if promised is not None:
+        pmdp = with_promise(pmdp, promised, refunds)
+        check_promise(pmdp, promised[0])
     spec = {
         "env": record.name_of(env),
         "key": record.key_data(key),
         "members": [member._asdict() for member in members],
         "config": config,
         "lookahead": lookahead,
+        **({} if promised is None else {"c": list(promised), "refunds": refunds}),
         "learning_penalty_from": learning_penalty_from,
         "insecure_penalty": insecure_penalty,
         "penalty": penalty,
@@ -151,6 +164,89 @@ def _same_threat(folder: Path, threat: ThreatFunction) -> None:
                 f"folder is {folder}; it holds a threat function with the checksum {there[:16]}; "
                 f"it must be new, empty, or hold the one that is given, with {wanted[:16]}"
             )
+
+
+def promised_of(
+    c: float | Sequence[float] | None, x: Several | None, threat: ThreatFunction | None
+) -> tuple[float, float] | None:
+    """Returns the least and the greatest danger that are promised, checked; None for no promise.
+
+    Args:
+        c: the danger of an episode, or a range of it.
+        x: cap on each step.
+        threat: the threat function, without which nothing can be promised.
+
+    Raises:
+        ValueError: c is no danger, no range, or contradicts x or the lack of threats.
+    """
+    if c is None:
+        return None
+    values = list(c) if isinstance(c, Sequence) else [c, c]
+    if len(values) != 2:
+        raise ValueError(f"c has {len(values)} values; it must be a number, or the two of a range")
+    for value in values:
+        number("c", value, above=0)
+    if values[0] > values[1]:
+        raise ValueError(f"c is {shown(c)}; the first number must not be greater than the second")
+    if threat is None:
+        raise ValueError(f"c is {shown(c)}, but there is no threat; one must be given to keep c")
+    if x is not None and any(value == float("inf") for value in _listed(x)):
+        raise ValueError(f"x is {shown(x)}, which forbids nothing; beside c it must be finite")
+    return float(values[0]), float(values[1])
+
+
+def caps_of(c: Any, x: Several | None) -> Several:
+    """Returns the thresholds of single steps: by default .01, or none where there is a budget.
+
+    Args:
+        c: danger promised, or None.
+        x: what was asked for.
+    """
+    if x is not None:
+        return x
+    return 0.01 if c is None else float("inf")
+
+
+def with_promise(pmdp: PMDP, promised: tuple[float, float], refunds: int) -> PMDP:
+    """Returns a P-MDP whose episodes carry a budget of danger.
+
+    Args:
+        pmdp: without one.
+        promised: least and greatest danger c of an episode.
+        refunds: outcomes by which the danger of a chosen action is booked.
+
+    Raises:
+        ValueError: a number is out of range.
+    """
+    number("refunds", refunds, least=0, most=10_000, integer=True)
+    env, params = budgeted.with_budget(pmdp.env, pmdp.params, *promised)
+    return pmdp.replace(env=env, params=params, refunds=refunds)
+
+
+def check_promise(pmdp: PMDP, c: float, starts: int = 256) -> None:
+    """Raises ValueError if already the least danger of the starts is greater than c on average.
+
+    Args:
+        pmdp: whose episodes carry a budget.
+        c: the danger that is promised.
+        starts: how many are drawn.
+
+    Raises:
+        ValueError: the threats leave more danger than c; the message says how much.
+    """
+    keys = jax.random.split(key_of(jax.random.key(0), Stream.STARTS), starts)
+    least = float(jnp.mean(_least_at_starts(keys, pmdp)))
+    if least > c:
+        raise ValueError(
+            f"c is {c:g}; it must be {least:.2g} or more: so much danger do the threats leave at "
+            f"the starts of this world on average (of {starts}), whatever the agent does"
+        )
+
+
+@jax.jit
+def _least_at_starts(keys: Array, pmdp: PMDP) -> Array:
+    states = jax.vmap(pmdp.env.reset, (0, None))(keys, pmdp.params)
+    return jnp.minimum(jnp.min(pmdp.threat(states), axis=-1), 1.0)
 
 
 def members_of(

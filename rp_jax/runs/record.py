@@ -23,6 +23,7 @@ import rp_jax
 from rp_jax import storage
 from rp_jax.checkpoints import NO_CHECKPOINTS, Checkpoints
 from rp_jax.envs.contract import FUNCTIONS
+from rp_jax.planning.wrapped import Wrapped
 
 CHECKPOINTS = "checkpoints"  # folder inside that of a job, until it is finished
 LOCK = "lock"  # held by the process that is at work on a job
@@ -117,8 +118,11 @@ def name_of(env: Any) -> str:
     """Returns the name that an environment can be imported by, or that of its class.
 
     Args:
-        env: a module, or an object.
+        env: a module, or an object; of a world with a threshold or a budget in its states, what
+            counts is the world inside.
     """
+    if isinstance(env, Wrapped):
+        return name_of(env.env)
     return getattr(env, "__name__", None) or f"{type(env).__module__}.{type(env).__qualname__}"
 
 
@@ -211,6 +215,8 @@ def name_of_module(env: Any) -> str:
     Args:
         env: a module, a class, or an object.
     """
+    if isinstance(env, Wrapped):
+        return name_of_module(env.env)
     if isinstance(env, ModuleType):
         return env.__name__
     return env.__module__ if isinstance(env, type) else type(env).__module__

@@ -16,6 +16,7 @@ from rp_jax import storage
 from rp_jax.envs import optional
 from rp_jax.envs.contract import FUNCTIONS, Env
 from rp_jax.planning import loop
+from rp_jax.planning.budgeted import unwrapped, with_budget
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.planning.networks import POOLS
 from rp_jax.planning.percept import Encoded, encode
@@ -109,8 +110,12 @@ def load(folder: str | Path, env: Env | None = None, params: Any = None) -> Any:
         env=world,
         pool=POOLS[config.network],
         lookahead=int(about.get("lookahead", 0)),
+        refunds=int(about.get("refunds", 0)),
         shielded=threat is not None,
     )
+    if promised := about.get("c"):
+        budget, spread = with_budget(world, params, *promised)
+        pmdp = pmdp.replace(env=budget, params=spread)
     return restored_agents(folder, about, pmdp, threat)
 
 
@@ -193,12 +198,13 @@ def save_agents(folder: Path, agents: Agents, more: Mapping[str, Any]) -> None:
     Raises:
         storage.StorageError: it cannot be written.
     """
-    env, params, network = agents.pmdp.env, agents.pmdp.params, agents.network
+    seen = _seen(agents.pmdp.env, agents.pmdp.params, agents.pmdp.pool)
+    env, params = unwrapped(agents.pmdp.env, agents.pmdp.params)
+    network = agents.network
     if agents.threat is not None:
         agents.threat.save(folder / THREAT, record.name_of(env))
     settings = dict(more.get("settings") or {})
     facts, arrays = _difference(env, settings, params)
-    seen = _seen(env, params, agents.pmdp.pool)
     about = {
         "env": record.name_of(env),
         "settings": settings,
@@ -212,6 +218,8 @@ def save_agents(folder: Path, agents: Agents, more: Mapping[str, Any]) -> None:
         "shielded": agents.pmdp.shielded,
         "threat": None if agents.threat is None else agents.threat.checksum,
         "lookahead": agents.pmdp.lookahead,
+        "c": None if agents.promised is None else list(agents.promised),
+        "refunds": agents.pmdp.refunds,
         "insecure_penalty": float(agents.pmdp.insecure_penalty),
         "seconds": agents.seconds,
         "version": rp_jax.__version__,

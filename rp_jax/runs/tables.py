@@ -28,6 +28,9 @@ COLUMNS = [
     "goal_rate",
     "interventions",
     "insecure",
+    "promised",
+    "booked_mean",
+    "booked_ci95",
     "seconds_per_100_actions",
     "train_seconds",
 ]
@@ -123,7 +126,20 @@ def in_words(row: Mapping[str, Any]) -> dict[str, str]:
         "danger of an episode, mean": _rounded(row["danger_mean"]),
         **{name: f"{100 * share:.3f}" for name, share in shares.items()},
         **{name: _rounded(seconds) for name, seconds in times.items() if seconds is not None},
+        **_account(row),
         "what was hit": hits(row["collisions"]) or "nothing",
+    }
+
+
+def _account(row: Mapping[str, Any]) -> dict[str, str]:
+    """Returns what is known of a row's budget, in words; nothing where there is none."""
+    if "promised" not in row:
+        return {}
+    return {
+        "danger promised, at most": f"{row['promised']:g}",
+        "danger booked, mean +- half of its 95 % interval": (
+            f"{row['booked_mean']:.5f} +- {row['booked_ci95']:.5f}"
+        ),
     }
 
 

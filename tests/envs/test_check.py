@@ -116,9 +116,9 @@ def plans_without_clearance():
     return changed(jam, leave_out=["clearance"]), jam.make_params(baseline="plans")
 
 
-@mutant("contract", r"threshold\(state\) is int32\[\]; it must be \(\) floating")
+@mutant("contract", r"threshold\(state, x, least\) is int32\[\]; it must be \(\) floating")
 def a_threshold_that_is_whole():
-    return changed(crossing, threshold=lambda state: state.time), crossing.make_params()
+    return changed(crossing, threshold=lambda state, x, least: state.time), crossing.make_params()
 
 
 @mutant("contract", r"threshold of the environment is 0.01; it must be a function")

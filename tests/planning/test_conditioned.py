@@ -9,6 +9,7 @@ import pytest
 from rp_jax.envs import jam
 from rp_jax.planning import conditioned, loop
 from rp_jax.planning.loop import LoopConfig
+from rp_jax.planning.wrapped import ranged
 from rp_jax.threat.model import ThreatModel, ThreatNetwork
 
 XS = (0.05, 0.3, 0.9)
@@ -84,7 +85,7 @@ def test_the_threshold_is_seen_after_all_else():
 
 def test_thresholds_are_spread_over_the_orders_of_magnitude():
     env = conditioned.Conditioned(probe)
-    params = conditioned.make_params(probe.make_params(), 1e-4, 1e-1)
+    params = ranged(probe.make_params(), 1e-4, 1e-1)
     keys = jax.random.split(jax.random.key(1), 3000)
     states = jax.vmap(env.reset, (0, None))(keys, params)
     digits = np.log10(np.asarray(states.x))
@@ -113,4 +114,4 @@ def test_the_threshold_stays_for_the_episode_and_is_drawn_anew_after_it():
 @pytest.mark.parametrize(("low", "high", "field"), [(0.0, 1.0, "low"), (0.1, 0.01, "high")])
 def test_a_range_without_thresholds_is_refused(low, high, field):
     with pytest.raises(ValueError, match=f"^{field} is "):
-        conditioned.make_params(probe.make_params(), low, high)
+        ranged(probe.make_params(), low, high)

@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+import types
 
 import jax
 import jax.numpy as jnp
@@ -106,6 +107,52 @@ def test_several_thresholds_learn_side_by_side(params, threat):
     free = rp_jax.plan(KEY, probe, params, learning_penalty=(0.0, 9.0), config=LEARNER)
     assert free.methods == ["DQN (penalty 0)", "DQN (penalty 9)"]
     assert free[0].look(STARTS).admissible.all()
+
+
+def test_one_agent_keeps_whatever_danger_it_is_promised(params, threat, tmp_path):
+    """It learns with budgets from .05 to .5, and comes back from a file with them."""
+    found = rp_jax.plan(KEY, probe, params, threat, c=(0.05, 0.5), refunds=2, config=LEARNER)
+    assert found.methods == ["RP (c=0.05 to 0.5)"]
+    assert found.promised == pytest.approx((0.05, 0.5))
+    rp_jax.save(tmp_path, found)
+    loaded = rp_jax.load(tmp_path, probe, params)
+    assert (loaded.promised, loaded.pmdp.refunds) == (found.promised, 2)
+    for agents in (found, loaded):
+        (row,) = rp_jax.evaluate(KEY, agents, c=0.25, episodes=40)
+        assert (row["env"], row["promised"]) == ("probe", 0.25)
+        assert row["method"] == "RP (c=0.25)"
+        assert row["danger_mean"] <= 0.25
+        assert np.isfinite(row["booked_mean"])
+    assert "danger promised, at most" in rp_jax.runs.tables.in_words(row)
+    with pytest.raises(ValueError, match=r"^c is 0.1, but these agents learned without"):
+        rp_jax.plan(KEY, probe, params, threat, x=0.5, config=LEARNER).in_world(c=0.1)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"c": 0.0}, "^c is 0.0; it must be"),
+        ({"c": -1.0}, "^c is -1.0"),
+        ({"c": float("nan")}, "^c is nan"),
+        ({"c": float("inf")}, "^c is inf"),
+        ({"c": (0.1, 0.01)}, "^c is .*; the first number must not be greater"),
+        ({"c": (0.1, 0.2, 0.3)}, "^c has 3 values"),
+        ({"c": 0.1, "x": float("inf")}, "^x is inf, which forbids nothing; beside c it must be"),
+        ({"c": 0.1, "refunds": -1}, "^refunds is -1"),
+    ],
+)
+def test_promises_that_make_no_sense_are_refused(given, words, params, threat):
+    with pytest.raises(ValueError, match=words):
+        rp_jax.plan(KEY, probe, params, threat, config=LEARNER, **given)
+
+
+def test_a_promise_needs_threats_and_must_be_possible(params, threat):
+    with pytest.raises(ValueError, match=r"^c is 0.1, but there is no threat"):
+        rp_jax.plan(KEY, probe, params, c=0.1, config=LEARNER)
+    grim = types.ModuleType("grim")
+    vars(grim).update(vars(probe), reset=lambda key, params: probe.start_at(probe.PIT))
+    with pytest.raises(ValueError, match=r"^c is 0.1; it must be 1 or more: so much danger"):
+        rp_jax.plan(KEY, grim, params, threat, c=0.1, config=LEARNER)
 
 
 def test_progress_and_metrics_come_through_callbacks(params, threat):

@@ -138,8 +138,9 @@ def _observation_problems(env: Any, params: Any, state: Any) -> list[str]:
     if seen is None:
         return found
     if hasattr(env, "threshold"):
-        x, problems = shape_of("threshold", env.threshold, state)
-        found += problems or scalar("threshold(state)", x, "floating")
+        number = jax.ShapeDtypeStruct((), jax.dtypes.canonicalize_dtype(float))
+        x, problems = shape_of("threshold", env.threshold, state, number, number)
+        found += problems or scalar("threshold(state, x, least)", x, "floating")
     flat = getattr(seen, "ndim", None) == 1 and seen.shape[0] >= 1
     if not flat or not jnp.issubdtype(seen.dtype, jnp.floating):
         text = described(seen) if hasattr(seen, "dtype") else type(seen).__name__
