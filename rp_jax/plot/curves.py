@@ -282,6 +282,50 @@ def frontier(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
+def promises(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Draws the danger that was promised against the crash rate that was met, a panel per test.
+
+    Thick bars are exact 95 % intervals of these agents, thin ones those of the method. Left of the
+    diagonal the promise is kept.
+
+    Args:
+        rows: rows with variant, promised, crash_rate, crash_ci95, method_crash_ci95, return_mean
+            and return_ci95.
+        path: where to write the PNG.
+    """
+    variants = list(dict.fromkeys(row["variant"] for row in rows))
+    figure = Figure(figsize=(3.4 * len(variants), 6.2), layout="constrained")
+    axes = figure.subplots(2, len(variants), sharey="row", squeeze=False)
+    floor = 0.1 * min(row["promised"] for row in rows)
+    for (upper, lower), variant in zip(axes.T, variants, strict=True):
+        of = [row for row in rows if row["variant"] == variant]
+        promised = [row["promised"] for row in of]
+        ends = [0.6 * min(promised), 1.6 * max(promised)]
+        upper.plot(ends, ends, color="black", linestyle="--", linewidth=1, label="promised = met")
+        shown = [max(row["crash_rate"], floor) for row in of]
+        for name, width in (("method_crash_ci95", 1), ("crash_ci95", 4)):
+            for row in of:
+                low, high = row.get(name) or row["crash_ci95"]
+                kept = high <= row["promised"] or low <= row["promised"]
+                style = {"color": BLUE if kept else RED, "linewidth": width, "alpha": 0.7}
+                upper.plot([row["promised"]] * 2, [max(low, floor), max(high, floor)], **style)
+        upper.plot(promised, shown, "o", color=BLUE, markersize=5, label="crashes of all episodes")
+        upper.set_xscale("log")
+        upper.set_yscale("log")
+        upper.set_title(variant)
+        returns, widths = ([row[k] for row in of] for k in ("return_mean", "return_ci95"))
+        lower.errorbar(promised, returns, widths, color=BLUE, marker=".", capsize=2)
+        lower.set_xscale("log")
+        lower.set_xlabel("danger promised for an episode, c")
+        for axis in (upper, lower):
+            axis.grid(alpha=0.3)
+    axes[0, 0].set_ylabel(f"crash rate met (those below {floor:g} at the edge)")
+    axes[0, 0].set_ylim(bottom=0.8 * floor)
+    axes[1, 0].set_ylabel("return (crash penalty included)")
+    axes[0, 0].legend(fontsize=8)
+    figure.savefig(path, dpi=120)
+
+
 def before_crashes(crashes: Sequence[Sequence[Mapping[str, Any]]], path: Path) -> None:
     """Draws the threat and the risks in the last steps before each crash.
 
