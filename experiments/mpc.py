@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import jax
 
+from experiments.figures.words import counted
 from experiments.paper.published import AVOIDED
 from experiments.resumable import Command, main
 from experiments.tasks import EXPERIMENTS
@@ -78,7 +79,7 @@ def prepared(config: Config) -> Ready:
 
 def job(config: Config, ready: Ready, folder: Path) -> None:
     """Plays all variants; writes the table and shows it."""
-    with terminal.progress(f"MPC ({config.horizon} steps)") as bar:
+    with terminal.progress(f"MPC ({counted(config.horizon, 'step')})") as bar:
         found = evaluate_search(
             jax.random.key(config.seed),
             ready.searches,

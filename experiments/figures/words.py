@@ -23,12 +23,7 @@ def variant(name: str) -> str:
     return TRACKS.get(name, name)
 
 
-def method(name: str) -> str:
-    """Returns what a method is called, with a plural only where there are several steps."""
-    return name.replace("(1 steps)", "(1 step)")
-
-
 def told(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Returns the same rows, variants and methods in plain words."""
-    words = {"variant": variant, "method": method}
-    return [{**row, **{k: say(row[k]) for k, say in words.items() if k in row}} for row in rows]
+    """Returns the same rows, variants in plain words."""
+    plain = [{"variant": variant(row["variant"])} if "variant" in row else {} for row in rows]
+    return [{**row, **words} for row, words in zip(rows, plain, strict=True)]

@@ -117,7 +117,7 @@ def line(env: str, row: Row) -> Row:
     """A line of a table: what a method's agents do on a task after learning."""
     return {
         "task": env,
-        "method": words.method(row["method"]),
+        "method": row["method"],
         "seeds": row["seeds"],
         "return": tables.earned(row),
         "crashes": tables.crashed(row),

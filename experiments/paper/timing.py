@@ -25,7 +25,7 @@ from rp_jax.runs.agents import Agent
 from rp_jax.runs.dataclass_json import restored
 from rp_jax.runs.evaluate import Timing, acting, greedily, timed
 from rp_jax.runs.policy_gradient import by_mode
-from rp_jax.runs.tree_search import time_search
+from rp_jax.runs.tree_search import method_name, time_search
 from rp_jax.streams import Stream, key_of
 from rp_jax.threat.build import ThreatConfig
 
@@ -122,7 +122,7 @@ def timers_of(env: str, own: dict[str, Agent], penalty: float) -> dict[str, Call
     avoided = published.AVOIDED.get(env, penalty)
     for steps in SEARCHES[env]:
         search = make_search(model, free.params, steps, avoided)
-        found[f"MPC ({steps} steps)"] = functools.partial(time_search, key, search)
+        found[method_name(search)] = functools.partial(time_search, key, search)
     return found
 
 
@@ -138,7 +138,7 @@ def tell(results: dict[str, Any]) -> Section:
         lines.append(
             {
                 "task": env,
-                "method": words.method(method),
+                "method": method,
                 "seconds": f"{seconds:.4f}",
                 "paper": "" if paper is None else f"{paper:g}",
                 "released code, two cores": "" if again is None else f"{again:g}",

@@ -102,7 +102,8 @@ def method_name(search: Search) -> str:
         search: the settings.
     """
     limit = "" if jnp.isinf(search.limit) else f", x={float(search.limit):g}"
-    return f"MPC ({search.horizon} steps{limit})"
+    steps = "1 step" if search.horizon == 1 else f"{search.horizon} steps"
+    return f"MPC ({steps}{limit})"
 
 
 def play_search(

@@ -3,6 +3,7 @@
 import numpy as np
 from PIL import Image
 
+from experiments.figures.words import counted
 from experiments.paper.commands import COMMANDS
 from rp_jax import storage
 from rp_jax.evaluation import Episodes, summarise
@@ -28,6 +29,7 @@ def evaluated(variant, method, seed, rate, score=50.0, episodes=400):
         length=zeros + 10,
         interventions=zeros,
         insecure=zeros,
+        booked=zeros * 0.0,
         collisions={"wall": crashed},
         bad_observations=zeros,
         bad_threats=zeros,
@@ -87,7 +89,8 @@ class Stub:
         """Of a task, MPC included: tables, curves, pictures."""
         env = "jam" if env == "patrol" else env
         method = RP[env].replace("0.5", "0.1") if folder.name.endswith("x01") else RP[env]
-        method = f"MPC ({folder.name[-1]} steps)" if folder.name.startswith("mpc") else method
+        steps = counted(int(folder.name[-1]), "step") if folder.name.startswith("mpc") else ""
+        method = f"MPC ({steps})" if steps else method
         found = [
             evaluated(variant, method, seed, 0.01 * i)
             for i, variant in enumerate(VARIANTS[env])

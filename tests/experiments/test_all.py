@@ -334,7 +334,7 @@ def test_all_methods_are_timed_in_one_process(circuit_runs, tmp_path, monkeypatc
     monkeypatch.setattr(timing, "time_search", timed)
     results = timing.run(circuit_runs, tmp_path)
     found = {row["method"]: row["seconds"] for row in results["actions"]}
-    assert list(found) == ["RP", "DQN", "CPO", "MPC (1 steps)", "MPC (4 steps)"]
+    assert list(found) == ["RP", "DQN", "CPO", "MPC (1 step)", "MPC (4 steps)"]
     assert found["MPC (4 steps)"] == [4]
     assert all(len(seconds) == 1 and min(seconds) > 0 for seconds in found.values())
     assert {row["variant"] for row in results["actions"]} == {"circle"}

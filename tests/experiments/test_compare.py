@@ -38,7 +38,7 @@ def test_every_method_has_its_rows(finished, tmp_path, monkeypatch, capsys):
     methods = list(dict.fromkeys(row["method"] for row in rows))
     assert methods == [
         *("RP (x=0.001)", "DQN (penalty 0)", "DQN (penalty 20)"),
-        *("CPO", "PID-Lagrangian", "MPC (1 steps)"),
+        *("CPO", "PID-Lagrangian", "MPC (1 step)"),
     ]
     for method in methods:
         mine = [row for row in rows if row["method"] == method]

@@ -20,7 +20,7 @@ def test_the_command_writes_a_table(tmp_path, capsys):
     command(*words, "--out", str(out))
     assert {path.name for path in out.iterdir()} == {"config.json", "table.csv", "table.json"}
     (row,) = json.loads((out / "table.json").read_text())
-    assert (row["variant"], row["method"], row["episodes"]) == ("N=3", "MPC (1 steps)", 3)
+    assert (row["variant"], row["method"], row["episodes"]) == ("N=3", "MPC (1 step)", 3)
     assert row["seconds_per_100_actions_in_batch"] > 0
     assert row["cpu_seconds_per_100_actions"] > 0
     penalties = json.loads((out / "config.json").read_text())["penalties"]

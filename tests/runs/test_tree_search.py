@@ -53,8 +53,8 @@ def test_only_the_episodes_asked_for_are_given(monkeypatch):
 
 def test_names_tell_steps_and_limit():
     search = search_among(1)
-    assert method_name(search) == "MPC (1 steps)"
-    assert method_name(search.replace(limit=np.float32(0.25))) == "MPC (1 steps, x=0.25)"
+    assert method_name(search) == "MPC (1 step)"
+    assert method_name(search.replace(limit=np.float32(0.25))) == "MPC (1 step, x=0.25)"
 
 
 @pytest.mark.parametrize(
