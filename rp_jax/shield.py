@@ -33,7 +33,9 @@ def shield(threat: Array, x: Array | float) -> Shield:
 
     Args:
         threat: (A,) threats T(s, .) of the actions.
-        x: () threshold; infinity switches the shield off.
+        x: () threshold; infinity switches the shield off. A plain number is rounded down to the
+            precision of the threats; `jax.jit` rounds an argument to the nearest number instead, so
+            give it as a constant there, or round it before (`rounded_down`).
 
     Returns:
         The set as a mask (A,), and whether the state is secure, ().
@@ -43,10 +45,24 @@ def shield(threat: Array, x: Array | float) -> Shield:
     """
     ranked(1, threat=threat)
     ranked(0, x=x) if hasattr(x, "shape") else number("x", x, infinite=True)
-    allowed = threat <= x
+    allowed = threat <= narrowed(x, threat.dtype)
     secure = jnp.any(allowed)
     fallback = jnp.arange(threat.shape[0]) == greedy_eta(threat)
     return Shield(admissible=jnp.where(secure, allowed, fallback), secure=secure)
+
+
+def narrowed(x: Any, dtype: Any) -> Any:
+    """Returns thresholds in a precision, nowhere greater than they were given.
+
+    Rounded to the nearest number, a threshold could admit a threat that is above it.
+
+    Args:
+        x: thresholds, of any shape; arrays of JAX are returned as they are.
+        dtype: type of the threats that they are compared with.
+    """
+    if isinstance(x, Array):
+        return x
+    return rounded_down(x) if jnp.dtype(dtype).itemsize <= 4 else np.asarray(x, np.float64)
 
 
 def rounded_down(x: Any) -> np.ndarray:

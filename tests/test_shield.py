@@ -12,6 +12,7 @@ from rp_jax.shield import (
     greedy_eta,
     masked_argmax,
     masked_sample,
+    narrowed,
     rounded_down,
     rounded_up,
     shield,
@@ -206,3 +207,27 @@ def test_threats_are_rounded_up_and_thresholds_down(value, above, below):
         assert found.dtype == np.float32
         assert found == np.float32(wanted)
     assert float(rounded_down(value)) <= value <= float(rounded_up(value))
+
+
+# As float32 numbers .001 and .002 are rounded up, .01 and .1 alternately down and up.
+@pytest.mark.parametrize("x", [0.001, 0.002, 0.01, 0.1, 0.5])
+def test_no_threat_above_the_given_threshold_is_admitted_by_rounding_it(x):
+    near = np.float32(x)
+    rows = np.asarray([np.nextafter(near, np.float32(to)) for to in (0, near, 1)], np.float32)
+    within = rows.astype(float) <= x
+    assert 0 < within.sum() < 3
+    for given_as in (x, np.float64(x), np.asarray(x)):
+        np.testing.assert_array_equal(shield(rows, given_as).admissible, within)
+        constant = jax.jit(lambda threat, x=given_as: correct(threat, rows, x))  # the highest score
+        assert float(rows[constant(rows).action]) <= x
+    both = shield(np.stack([rows[:2], rows[1:]])[0].astype(np.float64), x)
+    np.testing.assert_array_equal(both.admissible, within[:2])
+
+
+def test_thresholds_keep_what_needs_no_rounding():
+    traced = jnp.float32(0.001)
+    assert narrowed(traced, np.float32) is traced
+    assert narrowed(np.inf, np.float32) == np.inf
+    assert narrowed(-np.inf, np.float32) == -np.inf
+    assert narrowed(0.001, np.float64) == 0.001
+    assert narrowed(0.5, np.float32) == 0.5

@@ -62,7 +62,7 @@ def run(sources: Any, folder: Path) -> list[dict[str, Any]]:
         said = total_threat({"wall": pmdp.threats["wall"]}, states.body, {"wall": points})
         kinds = {"joint, exact": joint, "sum, exact": summed, "sum, models": said}
         for kind, threat in kinds.items():
-            admitted = compared(np.asarray(threat), joint, member.x)
+            admitted = compared(np.asarray(threat, float), joint, member.x)
             rows.append({"env": env, "of": kind, "x": member.x, **admitted})
     return rows
 

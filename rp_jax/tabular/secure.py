@@ -24,7 +24,7 @@ def secure(action_threat: Array, x: Array | float) -> Shield:
     Returns:
         The shield, with admissible (H, S, A) and secure (H, S).
     """
-    x = jnp.broadcast_to(x, action_threat.shape[:1])
+    x = jnp.broadcast_to(shield.narrowed(x, action_threat.dtype), action_threat.shape[:1])
     over_states = jax.vmap(shield.shield, in_axes=(0, None))
     return jax.vmap(over_states)(action_threat, x)
 

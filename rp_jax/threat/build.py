@@ -262,7 +262,7 @@ def calibrated(
     Returns:
         The shifted model, and the statement that holds for it.
     """
-    unsafe = np.asarray(data.threat) > x
+    unsafe = np.asarray(data.threat, float) > x  # not rounded to the labels' precision
     counted = unsafe.any(axis=1)
     n = int(counted.sum())
     if n == 0 or not 0 < x < 1:

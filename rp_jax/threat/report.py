@@ -35,9 +35,10 @@ def compare(predicted: np.ndarray, true: np.ndarray, x: float) -> dict[str, floa
         the number of states with an unsafe action; `states_missed`, how many of these have one
         called safe; and `states_missed_upper95`, the one-sided exact 95 % bound of their share.
     """
-    missed = (true > x) & (np.asarray(predicted) <= x)
+    predicted, true = np.asarray(predicted, float), np.asarray(true, float)  # x is not rounded
+    missed = (true > x) & (predicted <= x)
     states, of = int(missed.any(axis=-1).sum()), int((true > x).any(axis=-1).sum())
-    predicted, true = np.ravel(predicted).astype(float), np.ravel(true).astype(float)
+    predicted, true = np.ravel(predicted), np.ravel(true)
     error = predicted - true
     unsafe, called = true > x, predicted > x
     constant = np.ptp(predicted) == 0 or np.ptp(true) == 0

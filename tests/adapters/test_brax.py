@@ -220,6 +220,13 @@ def test_where_nothing_is_admissible_the_least_threatening_action_is_taken():
     assert state.pipeline_state["action"] == state.info["intervention"] == 0
 
 
+def test_a_threat_just_above_the_threshold_is_not_rounded_into_it():
+    above = np.float32(0.001)  # .0010000000475
+    env = brax.ShieldWrapper(Counter(), lambda state: jnp.asarray([above, 0.0, 0.0, 0.0]), 0.001)
+    state = jax.jit(env.step)(env.reset(raw(0)), jnp.asarray(0))
+    assert state.info["intervention"] == 1
+
+
 def test_a_shield_inside_the_training_wrappers_counts_by_episode():
     env = brax.ShieldWrapper(Counter(), threat_of, 0.1)
     env = brax.wrap(env, 100)

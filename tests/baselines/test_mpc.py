@@ -321,6 +321,12 @@ def test_alone_nothing_is_random(env):
         np.testing.assert_array_equal(a, b)
 
 
+def test_no_danger_above_the_limit_counts_as_safe_by_rounding_it():
+    for limit in (0.001, 0.01, np.inf):  # the nearest float32 to .001 is above it
+        found = float(mpc.make_search(jam, params_of("jam"), 2, 50.0, limit).limit)
+        assert found <= limit <= float(np.nextafter(np.float32(found), np.float32(np.inf)))
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

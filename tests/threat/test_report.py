@@ -32,6 +32,13 @@ def test_errors_and_decisions_by_hand():
     assert found["spearman"] == pytest.approx(expected)
 
 
+def test_the_threshold_of_decisions_is_not_rounded_to_the_precision_of_threats():
+    true = np.asarray([[0.001, 0.0], [0.001, 0.5]], np.float32)  # .0010000000475
+    found = compare(true, true, 0.001)
+    assert (found["unsafe"], found["unsafe_states"]) == (3, 2)
+    assert (found["unsafe_called_safe"], found["states_missed"]) == (0, 0)
+
+
 def test_the_order_alone_decides_the_rank_correlation():
     true = np.linspace(0, 1, 20)
     assert compare(true**3, true, 0.1)["spearman"] == pytest.approx(1)
