@@ -74,7 +74,7 @@ def learned(env: Env, params: Any, config: Config) -> Policy:
     from brax.training.agents.ppo import train as ppo
 
     adapted = brax.BraxEnv(env, params)
-    with terminal.progress() as bar:
+    with terminal.progress() as bar, brax.training_agents():
 
         def tell(done: int, metrics: dict[str, Any]) -> None:
             note = f"return {metrics['eval/episode_reward']:.1f}"
@@ -112,9 +112,7 @@ class BraxWorld(NamedTuple):
         """Returns the observations of states (B,)."""
         return states.obs
 
-    def advance(
-        self, keys: Any, states: Any, actions: Any, percept: Any
-    ) -> tuple[Any, Outcome]:
+    def advance(self, keys: Any, states: Any, actions: Any, percept: Any) -> tuple[Any, Outcome]:
         """Makes one transition of each state (B,), whose random keys are its own."""
         reached = self.env.step(states, actions)
         return reached, Outcome(

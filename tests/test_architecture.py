@@ -160,7 +160,7 @@ def test_without_its_library_an_adapter_says_what_to_install(adapter, library, a
 
 
 IMPORT_ALL = """
-import importlib, os, pkgutil, signal, sys, warnings
+import importlib, os, pkgutil, signal, sys, types, warnings
 told = os.fdopen(os.dup(1), "w")
 sys.stdout = sys.stderr = None  # whatever asks for a terminal fails
 for foreign in FOREIGN:
@@ -168,7 +168,14 @@ for foreign in FOREIGN:
 
 def state():
     handlers = {number: signal.getsignal(number) for number in signal.valid_signals()}
-    return handlers, list(warnings.filters), dict(os.environ), os.getcwd(), record.flags()
+    members = {
+        (name, member): id(value)  # modules come when they are first used
+        for name in (*FOREIGN, "jax", "jax.numpy", "jax.random", "numpy", "builtins")
+        for member, value in vars(sys.modules[name]).items()
+        if not isinstance(value, types.ModuleType)
+    }
+    settings = list(warnings.filters), dict(os.environ), os.getcwd(), record.flags()
+    return handlers, members, settings
 
 from rp_jax.runs import record
 before = state()

@@ -3,8 +3,9 @@
 Importing this module registers every environment: `brax.envs.get_environment("rp_jax_jam")`.
 """
 
+import contextlib
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -75,14 +76,14 @@ class BraxEnv(Env):
         """
         start, key = _split(rng)
         state = self.env.reset(_typed(start), self.params)
-        zero, no = jnp.zeros(()), jnp.zeros((), jnp.float32)
+        no = jnp.zeros(())
         return State(
             pipeline_state=state,
             obs=self.env.observe(state, self.params),
-            reward=zero,
+            reward=no,
             done=no,
-            metrics={"cost": zero, "goal": no},
-            info={"cost": zero, "truncation": no, "key": key},
+            metrics={"cost": no, "goal": no},
+            info={"cost": no, "truncation": no, "key": key},
         )
 
     def step(self, state: State, action: Array) -> State:
@@ -101,13 +102,15 @@ class BraxEnv(Env):
         now, later = _split(state.info["key"])
         args = _typed(now), state.pipeline_state, _checked(action), self.params
         reached, outcome = self.env.step(*args)
-        truncation = outcome.truncated.astype(jnp.float32)
-        cost, goal = outcome.danger, outcome.goal.astype(jnp.float32)
+        # brax's wrappers know no flags, but floats in the precision of JAX.
+        flags = outcome.terminated, outcome.truncated, outcome.goal
+        done, truncation, goal = (flag.astype(float) for flag in flags)
+        cost = outcome.danger
         return state.replace(
             pipeline_state=reached,
             obs=self.env.observe(reached, self.params),
             reward=outcome.reward,
-            done=outcome.terminated.astype(jnp.float32),
+            done=done,
             metrics=state.metrics | {"cost": cost, "goal": goal},
             info=state.info | {"cost": cost, "truncation": truncation, "key": later},
         )
@@ -282,11 +285,22 @@ def _device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
     return jax.tree.map(lambda a: jax.device_put(copies(a), sharding), tree)
 
 
-# The PPO and SAC of brax 0.14.2 call a function that jax 0.10 removed
-# (https://github.com/google/brax/issues/671). The development version of brax no longer does; this
-# can be removed after its next release.
-if not hasattr(jax, "device_put_replicated"):
+@contextlib.contextmanager
+def training_agents() -> Iterator[None]:
+    """Lets the agents of brax 0.14.2 train on new versions of jax, inside the context.
+
+    Its PPO and SAC call a function that jax 0.10 removed
+    (https://github.com/google/brax/issues/671). The development version of brax no longer does;
+    this can be removed after its next release.
+    """
+    if hasattr(jax, "device_put_replicated"):
+        yield
+        return
     jax.device_put_replicated = _device_put_replicated  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        del jax.device_put_replicated
 
 
 def _maker(name: str) -> Callable[..., BraxEnv]:

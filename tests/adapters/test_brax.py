@@ -7,6 +7,7 @@ import pytest
 from quick import compile_soon  # noqa: F401
 
 from rp_jax.adapters import brax, registry
+from rp_jax.envs import optional
 
 SETTINGS = {"jam": {"num_obstacles": 3}}
 ROWS = 5
@@ -66,15 +67,20 @@ def test_a_typed_key_starts_as_its_raw_one_does(name):
 
 @every_env
 @pytest.mark.parametrize("wrapped", [False, True])
-def test_a_state_keeps_its_structure_and_types_and_done_is_single_precision(name, wrapped):
-    env, key, action = made(name), raw(0), jnp.zeros(2)
-    if wrapped:
-        env, key, action = brax.wrap(env, 50), raws(0), jnp.zeros((ROWS, 2))
-    state = jax.eval_shape(env.reset, key)
-    reached = jax.eval_shape(env.step, state, action)
+@pytest.mark.parametrize("double", [False, True])
+def test_a_state_keeps_its_structure_and_its_types_those_of_the_precision(name, wrapped, double):
+    with jax.enable_x64(double):
+        env, key, action = made.__wrapped__(name), raw(0), jnp.zeros(2)
+        table = jnp.zeros((optional.num_actions(env.env, env.params), 2))
+        env = brax.ShieldWrapper(env, lambda state: jnp.zeros(len(table)), 0.1, table)
+        if wrapped:
+            env, key, action = brax.wrap(env, 50), raws(0), jnp.zeros((ROWS, 2))
+        state = jax.eval_shape(env.reset, key)
+        reached = jax.eval_shape(env.step, state, action)
+        assert state.obs.shape[-1] == env.observation_size
     assert described(reached) == described(state)
-    assert state.done.dtype == jnp.float32
-    assert state.obs.shape[-1] == env.observation_size
+    told = state.obs, state.reward, state.done, state.metrics, state.info["truncation"]
+    assert {a.dtype for a in jax.tree.leaves(told)} == {jnp.dtype(f"float{64 if double else 32}")}
     assert env.action_size == 2
     assert {"cost", "truncation"} <= set(state.info)
     assert "cost" in state.metrics
@@ -176,14 +182,14 @@ def test_anyones_environment_gets_fresh_starts():
 def threat_of(state):
     """Two of four actions are too dangerous, which ones depends on the state."""
     even = state.pipeline_state["left"] % 2 == 0
-    pattern = jnp.asarray([[0.0, 0.5, 0.9, 0.05], [0.5, 0.0, 0.1, 0.8]])
+    pattern = jnp.asarray([[0.0, 0.5, 0.9, 0.05], [0.5, 0.0, 0.125, 0.8]])
     return pattern[even.astype(jnp.int32)]
 
 
 @pytest.mark.parametrize("batched", [False, True])
 def test_no_inadmissible_action_passes_and_substitutes_are_counted(batched):
     env = brax.training.VmapWrapper(Counter()) if batched else Counter()
-    env = brax.ShieldWrapper(env, threat_of, 0.1)
+    env = brax.ShieldWrapper(env, threat_of, 0.125)
     step = jax.jit(env.step)
     state = env.reset(raws(0) if batched else raw(0))
     assert (state.info["intervention"] == 0).all()
@@ -191,7 +197,7 @@ def test_no_inadmissible_action_passes_and_substitutes_are_counted(batched):
         threat = np.asarray(threat_of(state)).reshape(-1, 4)
         action = jnp.full(ROWS, wish) if batched else jnp.asarray(wish)
         state = step(state, action)
-        expected = np.where(threat[:, wish] <= 0.1, wish, threat.argmin(axis=1))
+        expected = np.where(threat[:, wish] <= 0.125, wish, threat.argmin(axis=1))
         np.testing.assert_array_equal(np.ravel(state.pipeline_state["action"]), expected)
         np.testing.assert_array_equal(np.ravel(state.info["intervention"]), expected != wish)
         same_bits(state.info, state.metrics)
@@ -228,7 +234,7 @@ def test_a_threat_just_above_the_threshold_is_not_rounded_into_it():
 
 
 def test_a_shield_inside_the_training_wrappers_counts_by_episode():
-    env = brax.ShieldWrapper(Counter(), threat_of, 0.1)
+    env = brax.ShieldWrapper(Counter(), threat_of, 0.125)
     env = brax.wrap(env, 100)
     state, step = jax.jit(env.reset)(raws(0)), jax.jit(env.step)
     count, counted = np.zeros(ROWS), 0
@@ -242,8 +248,8 @@ def test_a_shield_inside_the_training_wrappers_counts_by_episode():
 
 
 def test_a_shield_around_the_training_wrappers_does_what_one_inside_does():
-    inside = brax.wrap(brax.ShieldWrapper(Counter(), threat_of, 0.1), 100)
-    around = brax.ShieldWrapper(brax.wrap(Counter(), 100), jax.vmap(threat_of), 0.1)
+    inside = brax.wrap(brax.ShieldWrapper(Counter(), threat_of, 0.125), 100)
+    around = brax.ShieldWrapper(brax.wrap(Counter(), 100), jax.vmap(threat_of), 0.125)
     states = [jax.jit(env.reset)(raws(0)) for env in (inside, around)]
     steps = [jax.jit(env.step) for env in (inside, around)]
     for t in range(9):
@@ -286,10 +292,21 @@ def test_repeated_actions_are_refused():
         brax.wrap(made("circuit"), 10, action_repeat=2)
 
 
-def test_what_jax_took_away_is_back():
-    assert callable(jax.device_put_replicated)
-    copies = brax._device_put_replicated({"a": jnp.arange(3), "b": 2.0}, jax.devices()[:1])
+def test_what_jax_took_away_is_back_while_agents_train(monkeypatch):
+    monkeypatch.delattr(jax, "device_put_replicated", raising=False)
+    with brax.training_agents(), brax.training_agents():
+        copies = jax.device_put_replicated({"a": jnp.arange(3), "b": 2.0}, jax.devices()[:1])
     same_bits(copies, {"a": np.arange(3)[None], "b": np.asarray([2.0])})
+    with pytest.raises(KeyError), brax.training_agents():
+        raise KeyError
+    assert not hasattr(jax, "device_put_replicated")
+
+
+def test_what_jax_still_has_is_left_alone(monkeypatch):
+    monkeypatch.setattr(jax, "device_put_replicated", "jax's own", raising=False)
+    with brax.training_agents():
+        assert jax.device_put_replicated == "jax's own"
+    assert jax.device_put_replicated == "jax's own"
 
 
 @pytest.mark.slow
@@ -304,7 +321,7 @@ def test_agents_of_brax_train(agent):
 
         settings = {"batch_size": 16, "min_replay_size": 64, "max_replay_size": 2048}
     told = []
-    with jax.numpy_rank_promotion("allow"):  # brax's agents need it
+    with brax.training_agents(), jax.numpy_rank_promotion("allow"):  # brax's agents need both
         make, weights, _ = train(
             environment=made("jam"),
             num_timesteps=2000,
