@@ -20,7 +20,7 @@ from rp_jax.recon import labels, sampling
 from rp_jax.threat import fit, report
 from rp_jax.threat.fit import Dataset, FitConfig
 from rp_jax.threat.model import ThreatModel, ThreatTable
-from rp_jax.validate import finite, number, one_of, random_key, shared_length
+from rp_jax.validate import finite, number, one_of, random_key, shared_length, within
 
 Progress = Callable[[str, int, int], None]  # called with (stage, done, total)
 SAMPLINGS = ("uniform", "preferential")
@@ -86,6 +86,9 @@ def check_config(kind: str, config: ThreatConfig, sub: SubRMDP) -> None:
             f"{kind}.tabled is True; it must be False for hazards whose threats are not enumerated "
             "or whose source has no `grid`"
         )
+    if config.tabled:
+        with within(kind):
+            _grid(sub, config.states)
 
 
 def can_table(sub: SubRMDP) -> bool:
@@ -210,14 +213,8 @@ def tabled(
         mesh: devices that share the nodes; None for one device.
         checkpoints: where to save labels that are done.
     """
-    low, step, shape = sub.source.grid(sub.body, nodes)
-    axes = [low[k] + step[k] * np.arange(count) for k, count in enumerate(shape)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(shape))
+    low, step, shape, grid = _grid(sub, nodes)
     features = jnp.asarray(grid, float)
-    some = features[:: max(1, len(features) // 100)]
-    again = jax.vmap(sub.source.features)(*sampling.states(sub, some))
-    if again.shape != some.shape or not np.allclose(again, some, atol=1e-4):
-        raise ValueError("grid of the source: its nodes must be features, which state_of inverts")
     estimator = labels.exact_threat
     data = _labelled(key, features, sub, estimator, "labels", on_progress, mesh, checkpoints)
     smallest = float(jnp.finfo(data.threat.dtype).eps)  # whose logit is still finite
@@ -226,6 +223,26 @@ def tabled(
     params = {"params": {name: jnp.asarray(value, float) for name, value in values.items()}}
     network = ThreatTable(shape, data.threat.shape[1])
     return ThreatModel(sub.source, params, jnp.ones(len(shape)), jnp.zeros(()), network)
+
+
+def _grid(sub: SubRMDP, nodes: int) -> tuple[Any, Any, tuple[int, ...], np.ndarray]:
+    """Returns what `grid` of a source says, checked, and the nodes (n, F) of that grid."""
+    low, step, shape = sub.source.grid(sub.body, nodes)
+    drawn = lambda key: sub.source.features(*sub.source.sample(key, sub.body))  # noqa: E731
+    (wanted,) = jax.eval_shape(drawn, jax.random.key(0)).shape
+    lengths = len(low), len(step), len(shape)
+    if set(lengths) != {wanted}:
+        raise ValueError(
+            "grid of the source: the first node, the steps and the numbers of nodes have the "
+            f"lengths {lengths}; each must be {wanted}, as `features` has"
+        )
+    axes = [low[k] + step[k] * np.arange(count) for k, count in enumerate(shape)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, wanted)
+    some = jnp.asarray(grid[:: max(1, len(grid) // 100)], float)
+    again = jax.vmap(sub.source.features)(*sampling.states(sub, some))
+    if not np.allclose(again, some, atol=1e-4):
+        raise ValueError("grid of the source: its nodes must be features, which state_of inverts")
+    return low, step, shape, grid
 
 
 class Calibration(NamedTuple):

@@ -146,3 +146,26 @@ def test_a_grid_of_other_features_is_named():
     fields = {name: getattr(sub.source, name) for name in sub.source.__dataclass_fields__}
     with pytest.raises(ValueError, match="grid of the source: its nodes must be features"):
         build.tabled(KEY, sub.replace(source=Behind(**fields)), 1_000)
+
+
+class Flat(WallPoint):
+    """Its grid leaves the speed out."""
+
+    def grid(self, model, nodes):
+        return tuple(part[:2] for part in super().grid(model, nodes))
+
+
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [
+        (Behind, "^wall: grid of the source: its nodes must be features"),
+        (Flat, r"^wall: grid of the source: .* the lengths \(2, 2, 2\); each must be 3, as"),
+    ],
+)
+def test_a_grid_that_does_not_fit_the_features_is_refused_before_any_label(kind, says):
+    sub = sub_of(jam)
+    fields = {name: getattr(sub.source, name) for name in sub.source.__dataclass_fields__}
+    config = build.ThreatConfig(states=1_000, tabled=True, exact=True)
+    build.check_config("wall", config, sub)
+    with pytest.raises(ValueError, match=says):
+        build.check_config("wall", config, sub.replace(source=kind(**fields)))
