@@ -16,6 +16,7 @@ from jax import Array
 from rp_jax import arrays, shield
 from rp_jax.adapters import registry
 from rp_jax.adapters.quiet import quietly
+from rp_jax.copies import parts
 from rp_jax.envs import contract, optional
 from rp_jax.validate import number, positive
 
@@ -47,6 +48,8 @@ class BraxEnv(Env):
 
     def __init__(self, env: contract.Env, params: Any):
         self.env, self.params = env, params
+
+    __reduce__ = parts
 
     @property
     def observation_size(self) -> int:

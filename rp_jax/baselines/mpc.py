@@ -14,6 +14,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from rp_jax.copies import parts
 from rp_jax.envs import optional
 from rp_jax.envs.contract import Env
 from rp_jax.hazards import is_static
@@ -51,6 +52,8 @@ class Search(struct.PyTreeNode):
     limit: Array  # () sequences of at most this danger are safe and come before all others
     model: Model = struct.field(pytree_node=False)  # the environment
     horizon: int = struct.field(pytree_node=False)  # number of actions of a sequence
+
+    __reduce__ = parts
 
     @property
     def actions(self) -> Array:

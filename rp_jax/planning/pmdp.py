@@ -9,6 +9,7 @@ from jax import Array
 
 from rp_jax import shield
 from rp_jax.arrays import replace_rows
+from rp_jax.copies import parts
 from rp_jax.dynamics import Plans
 from rp_jax.envs import optional
 from rp_jax.envs.contract import Env, Outcome
@@ -42,6 +43,8 @@ class PMDP(struct.PyTreeNode):
     refunds: int = struct.field(pytree_node=False, default=0)  # outcomes sampled of each chosen
     # action, to book the danger that it is expected to lead to; 0: its threat is booked
     shielded: bool = struct.field(pytree_node=False, default=True)  # False: all is admissible
+
+    __reduce__ = parts
 
     @property
     def num_actions(self) -> int:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
+from rp_jax.copies import parts
 from rp_jax.envs import optional
 from rp_jax.envs.contract import Env, Hazards
 from rp_jax.hazards import SubRMDP
@@ -70,6 +71,8 @@ class Wrapped:
     """
 
     env: Env  # the environment inside
+
+    __reduce__ = parts
 
     @property
     def LIDAR_BINS(self) -> int:  # noqa: N802

@@ -14,6 +14,7 @@ import jax
 from rp_jax import devices as sharing
 from rp_jax import storage
 from rp_jax.checkpoints import equal_chunks
+from rp_jax.copies import parts
 from rp_jax.envs.check import check_contract
 from rp_jax.planning.loop import LoopConfig
 from rp_jax.runs import record, saved, training
@@ -42,6 +43,10 @@ class World(NamedTuple):
     env: Any  # a module, or an object, with `make_params`
     settings: dict[str, Any]  # keywords of `make_params` while learning
     tests: dict[str, dict[str, Any]]  # by name, keywords of `make_params` while testing
+
+    def __reduce__(self) -> tuple:
+        """Returns how a copy is made, which shares the environment."""
+        return parts(self)
 
     def params(self, test: str | None = None) -> Any:
         """Returns the parameters while learning, or those of a test.
