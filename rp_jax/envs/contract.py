@@ -84,6 +84,9 @@ class Env(Protocol):
     def reset(self, key: Array, params: Any) -> Any:
         """Draws a start state; any other state of the same type can be stepped as well.
 
+        No array of it is an array of the parameters too, so that callers may give a state's memory
+        away (`donate_argnums` of `jax.jit`).
+
         Args:
             key: random key.
             params: the environment's parameters.

@@ -152,8 +152,9 @@ def granted(state: Any, c: Array) -> BudgetState:
         state: of the environment.
         c: () danger.
     """
-    c = jnp.asarray(c)
-    return BudgetState(state, c, c, jnp.zeros_like(c), jnp.zeros(c.shape, bool))
+    promised, budget = jnp.array(c), jnp.array(c)  # copies: each field has memory of its own
+    none = jnp.zeros_like(promised)
+    return BudgetState(state, promised, budget, none, jnp.zeros(none.shape, bool))
 
 
 def unwrapped(env: Env, params: Any) -> tuple[Env, Any]:

@@ -28,6 +28,7 @@ from rp_jax.envs.check import EnvError, check_contract, check_env, inspection
 from rp_jax.envs.check.batches import RandomDraws
 from rp_jax.envs.check.comparison import told_apart
 from rp_jax.envs.check.problems import own_settings
+from rp_jax.envs.check.purity import shared_memory
 from rp_jax.envs.check.trial import Trial
 from rp_jax.hazards import MovingObstacle, WallPoint
 from rp_jax.runs.plan import make_pmdp
@@ -458,6 +459,18 @@ def a_state_that_is_changed_in_place():
     def step(key, state, action, params):
         reached, outcome = crossing.step(key, bare(state), action, params)
         state.notes["seen"] = state.notes["seen"] + 1.0
+        return as_notes(reached, dict(state.notes)), outcome
+
+    return changed(crossing, reset=reset, step=step), crossing.make_params()
+
+
+@mutant("purity", r"reset: state.notes\['limit'\] and params.time_limit are one array", slow=True)
+def a_reset_that_hands_out_the_parameters():
+    def reset(key, params):
+        return as_notes(crossing.reset(key, params), {"limit": params.time_limit})
+
+    def step(key, state, action, params):
+        reached, outcome = crossing.step(key, bare(state), action, params)
         return as_notes(reached, dict(state.notes)), outcome
 
     return changed(crossing, reset=reset, step=step), crossing.make_params()
@@ -1074,6 +1087,17 @@ def test_there_is_no_false_alarm_over_twenty_seeds(name):
 def test_a_sound_world_has_a_sound_structure(name):
     env, make = SOUND[name]
     assert check_contract(env, make()) is None
+
+
+def test_who_shares_memory_is_told_by_name():
+    params = crossing.make_params()
+    state = crossing.reset(jax.random.key(0), params)
+    assert shared_memory("reset", state, params) == []
+    (problem,) = shared_memory("reset", state, params.replace(time_limit=state.time))
+    assert problem.startswith("reset: state.time and params.time_limit are one array; state.time ")
+    twice = state.replace(body=state.body.replace(heading=state.body.position))
+    (problem,) = shared_memory("step", twice, params)
+    assert problem.startswith("step: state.body.heading and state.body.position are one array")
 
 
 class World:

@@ -9,9 +9,14 @@ import pytest
 from quick import compile_soon  # noqa: F401
 
 from examples.crossing import world as crossing
+from examples.drone import world as drone
 from examples.trolley import world as trolley
 from rp_jax.envs import autoreset, circuit, contract, jam, optional, patrol, point_gather
+from rp_jax.envs.check.purity import shared_memory
 from rp_jax.hazards import SubRMDP
+from rp_jax.planning.budgeted import Budgeted
+from rp_jax.planning.conditioned import Conditioned
+from rp_jax.planning.wrapped import ranged
 
 ENVS = {
     "circuit": (circuit, lambda: circuit.make_params()),
@@ -70,6 +75,25 @@ def play(env, row_keys, params):
 
 
 jitted_play = jax.jit(play, static_argnums=0)
+
+
+APART = {
+    "drone": (drone, lambda: drone.make_params()),
+    "conditioned": (Conditioned(crossing), lambda: ranged(crossing.make_params(), 0.1, 0.1)),
+    "budgeted": (Budgeted(crossing), lambda: ranged(crossing.make_params(), 0.1, 0.1)),
+}
+
+
+@pytest.mark.parametrize("name", [*ENVS, *APART])
+def test_a_state_has_memory_of_its_own_which_may_be_given_away(name):
+    """Also if `reset` was not compiled; `donate_argnums` would delete what is shared."""
+    env, make = (ENVS | APART)[name]
+    params = make()
+    state = env.reset(jax.random.key(0), params)
+    assert shared_memory("reset", state, params) == []
+    if name == "budgeted":
+        jax.jit(env.step, donate_argnums=1)(jax.random.key(1), state, jnp.asarray(0), params)
+        assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(params))
 
 
 def keys_of(seed):

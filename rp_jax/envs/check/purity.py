@@ -1,4 +1,4 @@
-"""Whether functions depend on their arguments alone."""
+"""Whether functions depend on their arguments alone, and what they return has its own memory."""
 
 from typing import Any
 
@@ -20,8 +20,9 @@ def impurities(trial: Trial) -> list[str]:
         trial: the environment.
     """
     key = typed(trial.draws.keys(1)[0])
-    first = _host(trial.env.reset(key, trial.params))
-    found = _of_step(trial)
+    start = trial.env.reset(key, trial.params)
+    first = _host(start)
+    found = shared_memory("reset", start, trial.params) + _of_step(trial)
     again = first_difference(first, _host(trial.env.reset(key, trial.params)), "state", bits=True)
     if again is not None:
         found.append(
@@ -35,10 +36,11 @@ def _of_step(trial: Trial) -> list[str]:
     rows = trial.draws.among(np.arange(len(steps.action)), 2)
     calls = [_call(trial, row) for row in rows]
     given = [_host(state) for _, state, _, _ in calls]
-    made = [_host(step(*call)) for call in calls]
+    reached = [step(*call) for call in calls]
+    made = [_host(pair) for pair in reached]
     bits = jax.default_backend() == "cpu"  # elsewhere, sums may be taken in any order
     repeated = _differ(made[0], _host(step(*calls[0])), bits)
-    found = []
+    found = shared_memory("step", reached[0][0], trial.params)
     for (_, state, _, _), saved in zip(calls, given, strict=True):
         changed = first_difference(saved, _host(state), "state", bits=True)
         if changed is not None:
@@ -61,6 +63,36 @@ def _of_step(trial: Trial) -> list[str]:
             "it; both must be the same up to rounding"
         )
     return found
+
+
+def shared_memory(what: str, state: Any, params: Any) -> list[str]:
+    """Returns what says that a state's arrays are also in the parameters, or twice in the state.
+
+    Args:
+        what: the function that returned the state, for the sentence.
+        state: a state, from a function that was not compiled.
+        params: the parameters that the function was given.
+    """
+    names = {place: f"params{path}" for path, place in _places(params)}
+    for path, place in _places(state):
+        if place in names:
+            return [
+                f"{what}: state{path} and {names[place]} are one array; state{path} must be a copy "
+                "(jnp.copy), since whoever gives a state's memory away (donate_argnums of jax.jit) "
+                "gives both away"
+            ]
+        names[place] = f"state{path}"
+    return []
+
+
+def _places(tree: Any) -> list[tuple[str, int]]:
+    """Returns where the arrays of a pytree lie in memory."""
+    leaves = [
+        (jax.tree_util.keystr(path), leaf)
+        for path, leaf in jax.tree_util.tree_flatten_with_path(frozen(tree))[0]
+        if isinstance(leaf, jax.Array) and leaf.size
+    ]
+    return [(path, leaf.unsafe_buffer_pointer()) for path, leaf in leaves]
 
 
 def _call(trial: Trial, row: int) -> tuple[Any, Any, Any, Any]:
