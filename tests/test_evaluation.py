@@ -123,6 +123,7 @@ def made(score, danger, goal, length, interventions, insecure, pit):
         length=jnp.asarray(length),
         interventions=jnp.asarray(interventions),
         insecure=jnp.asarray(insecure),
+        booked=jnp.zeros(len(score)),
         collisions={"pit": jnp.asarray(pit, bool), "wall": jnp.zeros(len(score), bool)},
         bad_observations=jnp.zeros(len(score)),
         bad_threats=jnp.zeros(len(score)),

@@ -32,7 +32,7 @@ def playing(monkeypatch):
             zero = jnp.zeros(size)
             danger = jax.random.bernoulli(key, probability, (size,)).astype(float)
             no = jnp.zeros(size, int)
-            return evaluation.Episodes(zero, danger, no > 0, no + 1, no, no, {}, no, no)
+            return evaluation.Episodes(zero, danger, no > 0, no + 1, no, no, zero, {}, no, no)
 
         monkeypatch.setattr(module.evaluation, "play_round", play)
         monkeypatch.setattr(module, "ROUND", 100)
