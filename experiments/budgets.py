@@ -20,7 +20,7 @@ from rp_jax.cli.experiment import Experiment, Run
 from rp_jax.runs import promises, tables
 from rp_jax.runs.progress import OnProgress
 from rp_jax.runs.train import World
-from rp_jax.validate import number
+from rp_jax.validate import number, one_of
 
 PROMISED = (0.001, 0.003, 0.01, 0.03, 0.1)
 
@@ -31,7 +31,6 @@ class Config(jam.Config):
 
     promised: tuple[float, ...] = PROMISED  # danger of an episode
     threats: int = 3  # threat functions, each with `seeds` agents
-    refunds: int = 8  # outcomes by which the danger of an action taken is booked
 
     def validate(self) -> None:
         """Raises ValueError, naming the field, if a value is out of range."""
@@ -39,7 +38,7 @@ class Config(jam.Config):
         number("x", self.x, above=0, most=1)
         promises.check_promises(self.promised)
         number("threats", self.threats, least=1, most=1000, integer=True)
-        number("refunds", self.refunds, least=0, most=10_000, integer=True)
+        one_of("c", self.c, [None])  # there are several, in `promised`
 
 
 def quick(recipe: str) -> Config:

@@ -29,6 +29,7 @@ class Stream(enum.IntEnum):
     LOOKAHEAD = 14  # outcomes of actions by which a state's threats are lowered
     LOOKAHEAD_AGAIN = 15  # fresh outcomes of the actions that this alone would admit
     ACCOUNT = 16  # outcomes of a chosen action by which its danger is booked
+    CALIBRATION = 18  # states and rollouts that sums of threats are calibrated on
     LOTS = 17  # choices among equally good actions of a search
 
 
@@ -56,9 +57,11 @@ def key_of_state(state: Any, stream: Stream) -> Array:
         stream: the use; each has keys of its own.
     """
     words = jnp.concatenate([_words(leaf) for leaf in jax.tree.leaves(state)])
-    odd = np.random.default_rng(STATES).integers(2**31, size=words.size, dtype=np.uint32) * 2 + 1
+    factors = np.arange(1, words.size + 1, dtype=np.uint32) * np.uint32(0x9E3779B9)
+    for shift in (16, 13):  # so that the factors of neighbours have nothing in common
+        factors = (factors ^ (factors >> np.uint32(shift))) * np.uint32(0x85EBCA6B)
     mixed = words ^ (words >> 15)
-    digest = jnp.sum(mixed * jnp.asarray(odd, jnp.uint32), dtype=jnp.uint32)
+    digest = jnp.sum(mixed * jnp.asarray(factors | np.uint32(1)), dtype=jnp.uint32)
     return jax.random.fold_in(key_of(jax.random.key(STATES), stream), digest)
 
 

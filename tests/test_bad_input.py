@@ -100,7 +100,7 @@ def checked(devices):
 
 
 RUN = "seeds seed x lookahead learning_penalty learning_penalty_from insecure_penalty penalty "
-RUN += "episodes"
+RUN += "episodes c refunds"
 of_runs = st.dictionaries(st.sampled_from(RUN.split()), junk, min_size=1, max_size=3)
 
 

@@ -494,29 +494,36 @@ class Shielded(gymnasium.Wrapper, RecordConstructorArgs):
         self,
         env: gymnasium.Env,
         threat: Callable[[Any], Any],
-        x: float,
+        x: float | None = None,
         table: np.ndarray | None = None,
         state: Callable[[Any], Any] | None = None,
+        c: float | None = None,
     ):
         """Wraps an environment with a shield, which asks for the threats before every step.
 
         Args:
             env: the environment; it has Discrete actions, or with a table Box actions (D,).
             threat: maps a state to the threats (A,) of its actions.
-            x: greatest admissible threat; infinity lets every action pass.
+            x: greatest admissible threat; infinity lets every action pass. Beside c a cap.
             table: (A, D) the continuous actions that the threats belong to.
             state: finds the state in the unwrapped environment; by default the state is the last
                 observation.
+            c: danger that an episode may have, in place of x. Each action costs what its threat
+                exceeds the least threat by, and what is left of c decides (docs/budgets.md).
 
         Raises:
-            ValueError: x is not a number, the actions are not discrete and there is no table, or
-                the table does not fit them.
+            ValueError: neither x nor c is given, or one is not a number; the actions are not
+                discrete and there is no table, or the table does not fit them.
         """
         RecordConstructorArgs.__init__(
-            self, threat=threat, x=x, table=table, state=state, _disable_deepcopy=True
+            self, threat=threat, x=x, table=table, state=state, c=c, _disable_deepcopy=True
         )
         super().__init__(env)
-        self._x = np.float64(number("x", x, infinite=True))
+        if x is None and c is None:
+            raise ValueError("x is None, and so is c; one of them must be given")
+        self._x = np.float64(np.inf if x is None else number("x", x, infinite=True))
+        self._promised = None if c is None else number("c", c, above=0)
+        self._budget: float | None = None  # what may still be spent; None: before the first step
         for name, function in (("threat", threat), ("state", state)):
             if not (callable(function) or (name == "state" and function is None)):
                 raise ValueError(f"{name} is {function!r}; it must be a function")
@@ -551,6 +558,7 @@ class Shielded(gymnasium.Wrapper, RecordConstructorArgs):
             The observation, and the wrapped environment's table.
         """
         self._seen, info = self.env.reset(seed=seed, options=options)
+        self._budget = None
         return self._seen, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -563,7 +571,7 @@ class Shielded(gymnasium.Wrapper, RecordConstructorArgs):
 
         Returns:
             What the wrapped environment's `step` returns, with "intervention" and "insecure" in the
-            table.
+            table, and with "budget", what is left of c, where c is given.
 
         Raises:
             FloatingPointError: all threats are nan, or a number of the action is.
@@ -586,12 +594,23 @@ class Shielded(gymnasium.Wrapper, RecordConstructorArgs):
                 f"action: {np.isnan(wish).sum()} of {wish.size} numbers are nan"
             )
         with jax.enable_x64(True):  # narrowed threats could fall below x
-            chosen = _correct(threat, wish, self._x, self._table)
+            chosen = _correct(threat, wish, self._threshold(threat), self._table)
         row = int(chosen.action)
         taken = row + self._first if self._table is None else self._row(row)
         self._seen, reward, terminated, truncated, info = self.env.step(taken)
         told = {"intervention": bool(chosen.intervened), "insecure": not bool(chosen.secure)}
+        if self._budget is not None:
+            told["budget"] = self._budget = max(0.0, self._budget - threat[row] + np.nanmin(threat))
         return self._seen, reward, terminated, truncated, info | told
+
+    def _threshold(self, threat: np.ndarray) -> np.float64:
+        """Returns the greatest admissible threat, by x and by what is left of c."""
+        if self._promised is None:
+            return self._x
+        least = np.nanmin(threat)
+        if self._budget is None:
+            self._budget = float(self._promised - least)
+        return np.minimum(self._x, self._budget + least)
 
     def _row(self, row: int) -> np.ndarray:
         """Returns a row of the table as the environment takes it."""

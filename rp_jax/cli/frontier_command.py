@@ -34,6 +34,7 @@ def check(config: Any) -> None:
     number("x", config.x, above=0, most=1)  # the threat function is learned for it
     frontier.check_thresholds(config.thresholds)
     one_of("shield", config.shield, [True])
+    one_of("c", config.c, [None])  # the agents go by thresholds
 
 
 def job(run: Run, bar: OnProgress) -> None:

@@ -26,6 +26,7 @@ def check(config: TrainConfig) -> None:
     number("learning_penalty", config.learning_penalty, least=0, most=0)  # it is `penalty`
     one_of("learning_penalty_from", config.learning_penalty_from, [None])
     one_of("shield", config.shield, [True])
+    one_of("c", config.c, [None])  # what is compared goes by x
 
 
 def job(run: Run, bar: OnProgress) -> None:

@@ -84,6 +84,20 @@ def has_budget(env: Env) -> bool:
     return hasattr(env, "settle")
 
 
+def booked(env: Env, before: Any, after: Any, danger: Array) -> Array:
+    """Returns the danger that a step is booked with, (): by the budget's account if there is one.
+
+    Over an episode both have the same mean. The account knows what nearly happened, too.
+
+    Args:
+        env: the environment; by default what happened is booked.
+        before: the state before the step, unbatched.
+        after: the state after it.
+        danger: () of the step's outcome.
+    """
+    return after.booked - before.booked if has_budget(env) else danger
+
+
 def mixed_start(env: Env, key: Array, start: Any, fresh: Any) -> Any:
     """Returns a start state like a given one, with some parts taken from another.
 

@@ -216,7 +216,7 @@ def interact(
     epsilon = exploration(state.iteration, config)
     keys = jax.random.split(choose_key, batch)
     action = jax.vmap(_choose, (0, 0, 0, None))(keys, values, state.seen.admissible, epsilon)
-    carried, (_, seen), outcome = autoreset.step_and_renew(
+    carried, (reached, seen), outcome = autoreset.step_and_renew(
         pmdp.env,
         jax.random.split(step_key, batch),
         state.states,
@@ -227,7 +227,9 @@ def interact(
         advance=lambda keys, states, action: pmdp.advance(keys, states, action, state.seen),
     )
     insecure = ~seen.secure & ~outcome.terminated
-    reward = outcome.reward - pmdp.penalty * outcome.danger - pmdp.insecure_penalty * insecure
+    booked = jax.vmap(optional.booked, (None, 0, 0, 0))
+    danger = booked(pmdp.env, state.states, reached, outcome.danger)
+    reward = outcome.reward - pmdp.penalty * danger - pmdp.insecure_penalty * insecure
     taken = WindowStep(
         encoded=state.seen.encoded,
         action=action,

@@ -15,6 +15,7 @@ from rp_jax.envs import optional
 from rp_jax.envs.contract import Env, Outcome
 from rp_jax.planning.percept import Percept, encode
 from rp_jax.streams import Stream, key_of_state
+from rp_jax.threat.correction import SumCorrection
 from rp_jax.threat.model import ThreatModel
 from rp_jax.threat.static import compress_above_one, plan_clearances, static_threat
 from rp_jax.threat.total import total_threat
@@ -37,6 +38,7 @@ class PMDP(struct.PyTreeNode):
     penalty: Array  # () subtracted from the reward per unit of danger while learning
     insecure_penalty: Array  # () subtracted for each insecure state that is reached
     env: Env = struct.field(pytree_node=False)  # the environment
+    correction: SumCorrection | None = None  # of the sum over hazards that models are learned for
     pool: int = struct.field(pytree_node=False, default=8)  # number of LIDAR bins pooled into one
     lookahead: int = struct.field(pytree_node=False, default=0)  # outcomes sampled of each action
     # where a state's own threats admit none; 0: no look-ahead
@@ -203,12 +205,17 @@ class PMDP(struct.PyTreeNode):
         if static is None and not hazards:
             return jnp.zeros((states.time.shape[0], self.num_actions))
         if static is None:
-            return total_threat(self.threats, states.body, hazards)
+            return self._corrected(total_threat(self.threats, states.body, hazards))
         if hazards:
-            moving = compress_above_one(total_threat(self.threats, states.body, hazards))
+            summed = self._corrected(total_threat(self.threats, states.body, hazards))
+            moving = compress_above_one(summed)
             static = static + moving.reshape(static.shape)
         best = jnp.min(static, axis=1)
         return best if alive is None else jnp.where(alive[:, None], best, 0.0)
+
+    def _corrected(self, total: Array) -> Array:
+        """Returns sums over hazards, raised where calibration found them too low."""
+        return total if self.correction is None else self.correction(total)
 
     def _backup(self, states: Any, actions: Array, use: Stream, count: int) -> Array:
         """Returns E[d + m(s')] of chosen actions, (R,), where m is the least sum over hazards.

@@ -65,7 +65,7 @@ def drawn_level(key: Array, params: RangedParams) -> Array:
 
 @dataclass(frozen=True)
 class Wrapped:
-    """What an environment (`rp_jax.envs.Env`) with one more value in its observation hands on.
+    """Base of environments (`rp_jax.envs.Env`) that add one value to another's observation.
 
     States have the environment's own state as `inner`.
     """

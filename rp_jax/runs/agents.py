@@ -218,7 +218,9 @@ def side_by_side(pmdp: PMDP, members: Sequence[Member]) -> tuple[PMDP, PMDP]:
     """
     x = jnp.asarray(rounded_down([member.x for member in members]), float)
     penalty = jnp.asarray([member.learning_penalty for member in members], float)
-    axes = pmdp.replace(params=None, threats=None, x=0, penalty=0, insecure_penalty=None)
+    axes = pmdp.replace(
+        params=None, threats=None, x=0, penalty=0, insecure_penalty=None, correction=None
+    )
     return pmdp.replace(x=x, penalty=penalty), axes
 
 

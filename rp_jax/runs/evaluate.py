@@ -95,7 +95,7 @@ def spec_of(key: Array, agents: Agents) -> dict[str, Any]:
         "env": record.name_of(pmdp.env),
         "key": record.key_data(key),
         "params": record.digest_of(pmdp.params),
-        "agents": record.digest_of((agents.weights, pmdp.threats)),
+        "agents": record.digest_of((agents.weights, pmdp.threats, pmdp.correction)),
         "members": [member._asdict() for member in agents.members],
         "network": agents.config.network,
         "lookahead": pmdp.lookahead,

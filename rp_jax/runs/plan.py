@@ -135,7 +135,7 @@ def plan(
         "insecure_penalty": insecure_penalty,
         "penalty": penalty,
         "params": record.digest_of(params),
-        "threat": None if threat is None else record.digest_of(threat.models),
+        "threat": None if threat is None else record.digest_of((threat.models, threat.correction)),
     }
     where = None if folder is None else path("folder", folder)
     if where is not None and threat is not None:
@@ -332,6 +332,7 @@ def make_pmdp(
     return PMDP(
         params=params,
         threats={} if threat is None else dict(threat.models),
+        correction=None if threat is None else threat.correction,
         x=jnp.asarray(rounded_down(x), float),
         penalty=jnp.asarray(learning_penalty, float),
         insecure_penalty=jnp.asarray(insecure_penalty, float),

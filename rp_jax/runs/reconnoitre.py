@@ -24,11 +24,13 @@ from rp_jax.shield import rounded_down
 from rp_jax.streams import Stream, key_of
 from rp_jax.threat import artefact, build, report
 from rp_jax.threat.build import ThreatConfig
+from rp_jax.threat.correction import Statement, SumCorrection, calibrated_sum
 from rp_jax.threat.function import ThreatFunction, load_threat
 from rp_jax.threat.total import total_threat
 from rp_jax.validate import number, one_of, path, random_key, shown
 
 VISITED = 256  # states of the world that sums of threats are judged on
+CALIBRATION_SHARE = 0.25  # of the rollouts of a label; noise in labels makes calibration stricter
 
 
 def reconnoitre(
@@ -37,6 +39,7 @@ def reconnoitre(
     params: Any,
     *,
     x: float = 0.01,
+    miss_rate: float = 0.05,
     config: ThreatConfig | Mapping[str, ThreatConfig] | None = None,
     folder: str | Path | None = None,
     devices: str = "one",
@@ -52,6 +55,9 @@ def reconnoitre(
         env: the world, `rp_jax.envs.contract.Env`.
         params: its parameters.
         x: the threshold near which the threat has to be known best; others may be used later.
+        miss_rate: of the states that the world comes by with an action above a level of threat, the
+            greatest share that may have one called less: the sums are raised until that is shown,
+            with 95 % confidence for all levels (`threat.correction`); 1: they stay as they are.
         config: sizes and settings, of all kinds of hazard or by kind; tuned ones by default.
         folder: created if missing, where the threat function, its reports and, while it is
             learned, checkpoints are kept: the same call goes on where it was interrupted, and
@@ -69,6 +75,7 @@ def reconnoitre(
     """
     random_key("key", key)
     number("x", x, above=0)
+    number("miss_rate", miss_rate, above=0, most=1)
     one_of("devices", devices, sharing.DEVICES)
     check_contract(env, params)
     subs = env.sub_rmdps(params)
@@ -77,6 +84,7 @@ def reconnoitre(
         "env": record.name_of(env),
         "key": record.key_data(key),
         "x": x,
+        "miss_rate": miss_rate,
         "settings": settings,
         "params": record.digest_of((subs, params)),
     }
@@ -85,7 +93,8 @@ def reconnoitre(
         return _finished(where, subs, record.plain(spec))
     with record.job(where, "threat", {**spec, **record.machine(env)}) as checkpoints:
         return _learned(
-            key, env, params, x, settings, spec, where, devices, on_progress, checkpoints
+            *(key, env, params, x, miss_rate, settings),
+            *(spec, where, devices, on_progress, checkpoints),
         )
 
 
@@ -125,6 +134,7 @@ def _learned(
     env: Env,
     params: Any,
     x: float,
+    miss_rate: float,
     settings: Mapping[str, ThreatConfig],
     spec: Mapping[str, Any],
     folder: Path | None,
@@ -145,11 +155,22 @@ def _learned(
         built[kind] = build.learn_threat(own, subs[kind], settings[kind], x, tell, mesh, at)
     models = sharing.broadcast_first({kind: b.model for kind, b in built.items()})
     reports = {kind: b.report for kind, b in built.items()}
-    sums = judged_sums(
-        key, env, params, models, settings, x=x, on_progress=on_progress, checkpoints=checkpoints
-    )
+    common: dict[str, Any] = {"x": x, "on_progress": on_progress, "checkpoints": checkpoints}
+    sums = judged_sums(key, env, params, models, settings, **common)
+    correction: SumCorrection | None = None
+    statements: list[Statement] = []
+    if models and miss_rate < 1:
+        count = min(settings[kind].test_states for kind in models)
+        said, true = drawn_sums(
+            *(key, env, params, models, settings, Stream.CALIBRATION, count),
+            paths_share=CALIBRATION_SHARE,
+            **common,
+        )
+        correction, statements = calibrated_sum(sum(said.values()), sum(true.values()), miss_rate)
     about = {
         "x": x,
+        "correction": None if correction is None else correction.points,
+        "statements": [found._asdict() for found in statements],
         "reports": reports,
         "sums": sums,
         "settings": {kind: dataclasses.asdict(config) for kind, config in settings.items()},
@@ -205,7 +226,48 @@ def judged_sums(
     """
     if not models:
         return {}
-    walk, *keys = jax.random.split(key_of(key, Stream.SUMS), 1 + len(models))
+    said, true = drawn_sums(
+        *(key, env, params, models, settings, Stream.SUMS, VISITED),
+        x=x,
+        on_progress=on_progress,
+        checkpoints=checkpoints,
+    )
+    return {kind: report.compare(said[kind], true[kind], x) for kind in sorted(models)}
+
+
+def drawn_sums(
+    key: Array,
+    env: Env,
+    params: Any,
+    models: Mapping[str, Any],
+    settings: Mapping[str, ThreatConfig],
+    stream: Stream,
+    count: int,
+    *,
+    x: float,
+    on_progress: OnProgress,
+    checkpoints: Checkpoints,
+    paths_share: float = 1.0,
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Returns the models' sums over hazards and accurate ones, on states that the world comes by.
+
+    Args:
+        key: of everything random in it.
+        env: the world.
+        params: its parameters.
+        models: by kind of hazard.
+        settings: by kind; says how many rollouts an accurate label takes.
+        stream: what the states are for.
+        count: of states.
+        x: the threshold behind which they are visited.
+        on_progress: called with (stage, done, total, note).
+        checkpoints: of the labels.
+        paths_share: of the rollouts of an accurate label.
+
+    Returns:
+        By kind (count, A): what the models say, and what is true.
+    """
+    walk, *keys = jax.random.split(key_of(key, stream), 1 + len(models))
     pmdp = PMDP(
         params=params,
         threats=dict(models),
@@ -215,17 +277,20 @@ def judged_sums(
         env=env,
         pool=1,
     )
-    states = jax.jit(recording.visited_states, static_argnums=2)(walk, pmdp, VISITED)
+    states = jax.jit(recording.visited_states, static_argnums=2)(walk, pmdp, count)
     hazards = jax.jit(jax.vmap(env.hazards, (0, None)))(states, params)
-    subs, found = env.sub_rmdps(params), {}
+    subs, said, found = env.sub_rmdps(params), {}, {}
     for kind, own in zip(sorted(models), keys, strict=True):
-        on_progress(f"sum over {kind}s", 0, 1, "")
-        estimator = labels.best_estimator(subs[kind], settings[kind].test_paths)
-        true = report.labelled_sum(
-            own, states.body, hazards[kind], subs[kind], estimator, checkpoints.at(f"sum {kind}")
+        stage = f"{stream.name.lower()} over {kind}s"
+        on_progress(stage, 0, 1, "")
+        paths = max(2, round(paths_share * settings[kind].test_paths))
+        estimator = labels.best_estimator(subs[kind], paths)
+        at = checkpoints.at(f"{stream.name.lower()} {kind}")
+        found[kind] = report.labelled_sum(
+            own, states.body, hazards[kind], subs[kind], estimator, at
         )
         only = {kind: models[kind]}
-        said = jax.jit(total_threat)(only, states.body, {kind: hazards[kind]})
-        on_progress(f"sum over {kind}s", 1, 1, "")
-        found[kind] = report.compare(np.asarray(said), true, x)
-    return found
+        given = {kind: hazards[kind]}
+        said[kind] = np.asarray(jax.jit(total_threat)(only, states.body, given))
+        on_progress(stage, 1, 1, "")
+    return said, found

@@ -104,6 +104,7 @@ def load(folder: str | Path, env: Env | None = None, params: Any = None) -> Any:
     pmdp = PMDP(
         params=params,
         threats={} if threat is None else dict(threat.models),
+        correction=None if threat is None else threat.correction,
         x=jnp.zeros(()),
         penalty=jnp.zeros(()),
         insecure_penalty=jnp.asarray(float(about.get("insecure_penalty", 0.0))),

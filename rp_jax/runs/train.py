@@ -70,7 +70,9 @@ class TrainConfig:
 
     seeds: int = 1  # agents, side by side in one program
     seed: int = 0  # number of the first; the others count up
-    x: float = 0.01  # largest admissible threat
+    x: float = 0.01  # largest admissible threat; with c, where threats are learned most closely
+    c: float | None = None  # danger that an episode may have, in place of x
+    refunds: int = 8  # outcomes of the action taken by which its danger is booked, with c
     shield: bool = True  # off: no action is forbidden, as in DQN
     lookahead: int = 0  # outcomes of each action looked at where none is admissible
     learning_penalty: float = 0.0  # taken off the reward per unit of danger while learning
@@ -85,6 +87,11 @@ class TrainConfig:
         number("seeds", self.seeds, least=1, most=1000, integer=True)
         number("seed", self.seed, least=0, most=2**31 - 1001, integer=True)
         number("x", self.x, least=0, infinite=True)
+        if self.c is not None:
+            number("c", self.c, above=0)
+            if not self.shield:
+                raise ValueError("shield is False; with c it must be True")
+        number("refunds", self.refunds, least=0, most=10_000, integer=True)
         number("lookahead", self.lookahead, least=0, most=10_000, integer=True)
         number("learning_penalty", self.learning_penalty, least=0)
         if self.learning_penalty_from is not None:
@@ -230,10 +237,12 @@ def train(
         env,
         params,
         threat,
-        x=config.x,
+        c=config.c,
+        x=config.x if config.c is None else None,
         seeds=list(numbers),
         config=config.planning,
         lookahead=config.lookahead,
+        refunds=config.refunds,
         learning_penalty=config.learning_penalty,
         learning_penalty_from=config.learning_penalty_from,
         insecure_penalty=config.insecure_penalty,
@@ -344,7 +353,8 @@ def announced(config: TrainConfig, threat: ThreatFunction | None, world: World) 
     loop = config.planning
     chunks, length = equal_chunks(loop.learning, training.CHUNKS)
     steps = (loop.opening - 1 + loop.filling + chunks * length) * loop.num_envs
-    shield = "no shield" if threat is None else f"x = {config.x:g}"
+    limit = f"x = {config.x:g}" if config.c is None else f"c = {config.c:g}"
+    shield = "no shield" if threat is None else limit
     return (
         f"planning in {world.name}: {config.seeds} x {steps:,} steps, {loop.samples_per_step:g} "
         f"samples replayed per step, {shield}"

@@ -7,6 +7,7 @@ from typing import Any
 
 from rp_jax.hazards import SubRMDP
 from rp_jax.threat import artefact
+from rp_jax.threat.correction import SumCorrection, correction_of
 from rp_jax.threat.model import ThreatModel
 
 
@@ -35,6 +36,11 @@ class ThreatFunction:
         learned_in = self.about.get("environment") or self.about.get("spec", {}).get("env", "")
         name = environment or str(learned_in)
         artefact.save(Path(folder), name, self.models, self.subs, self.about)
+
+    @property
+    def correction(self) -> SumCorrection | None:
+        """The correction of sums over hazards that calibration found; None without calibration."""
+        return correction_of(self.about.get("correction"))
 
     def __repr__(self) -> str:
         sums, parts = self.about.get("sums", {}), []

@@ -490,8 +490,8 @@ def test_workers_that_are_spawned_step():
     env.close()
 
 
-def guarded_cart(threat=lambda _: np.asarray([0.0, 0.9]), x=0.1):
-    return adapter.Shielded(gymnasium.make("CartPole-v1"), threat, x)
+def guarded_cart(threat=lambda _: np.asarray([0.0, 0.9]), x=0.1, **others):
+    return adapter.Shielded(gymnasium.make("CartPole-v1"), threat, x, **others)
 
 
 def test_a_shield_needs_a_reset_before_it_asks_for_threats():
@@ -504,13 +504,35 @@ def test_a_shield_needs_a_reset_before_it_asks_for_threats():
     [
         ({"x": np.nan}, "^x is nan; it must be a number"),
         ({"x": "0.1"}, "^x is '0.1'; it must be a number"),
-        ({"x": None}, "^x is None; it must be a number"),
+        ({"x": None}, "^x is None, and so is c; one of them must be given"),
+        ({"c": -0.1}, r"^c is -0\.1; it must be a finite number"),
         ({"threat": None}, "^threat is None; it must be a function"),
     ],
 )
 def test_what_a_shield_is_made_of_is_checked_at_once(change, message):
     with pytest.raises(ValueError, match=message):
         guarded_cart(**change)
+
+
+def test_a_shield_spends_what_was_promised_and_then_takes_the_least_threatening_action():
+    """Threats .1 and .4: the second action costs .3 of the .7 that are left of c = .8."""
+    env = guarded_cart(lambda _: np.asarray([0.1, 0.4]), x=None, c=0.8)
+    for _ in range(2):  # each episode has a budget of its own
+        env.reset(seed=0)
+        for left, replaced in ((0.4, False), (0.1, False), (0.1, True)):
+            info = env.step(1)[-1]
+            assert info["intervention"] is replaced
+            assert info["budget"] == pytest.approx(left)
+            assert not info["insecure"]
+        assert env.step(0)[-1]["budget"] == pytest.approx(0.1)  # what is least costs nothing
+    capped = guarded_cart(lambda _: np.asarray([0.1, 0.4]), x=0.3, c=0.8)
+    capped.reset(seed=0)
+    assert capped.step(1)[-1]["intervention"]
+    grim = guarded_cart(lambda _: np.asarray([0.9, 0.95]), x=None, c=0.8)
+    grim.reset(seed=0)
+    info = grim.step(1)[-1]
+    assert info["insecure"]
+    assert info["budget"] == 0.0
 
 
 @pytest.mark.parametrize("table", [np.zeros((3, 2)), np.zeros(3), np.zeros((0, 1)), [[np.nan]]])

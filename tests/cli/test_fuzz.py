@@ -86,14 +86,16 @@ MANY = int(os.environ.get("RP_FUZZ", "100"))  # a refused command line takes 70 
 
 VALUES = "0 1 -1 2.5 nan inf -inf 1e400 1e-400 True None quick paper plans"
 NAMES = (
-    "seeds seed out threat devices x shield learning-penalty insecure-penalty penalty episodes "
-    "figures fidelity "
+    "seeds seed out threat devices x c refunds shield learning-penalty insecure-penalty penalty "
+    "episodes figures fidelity "
     "baseline obstacles test-obstacles track test-tracks bombs preset recipe resume wall.states "
     "wall.paths wall.sampling wall.miss-rate wall.fit.hidden wall.fit.steps wall.fit.validation "
     "planning.steps planning.num-envs planning.batch planning.replay planning.replay-start "
     "planning.n-step planning.learner.gamma planning.learner.period planning.network"
 )
-FIELDS = "seeds seed x shield penalty episodes lookahead planning wall test_obstacles fidelity"
+FIELDS = (
+    "seeds seed x c refunds shield penalty episodes lookahead planning wall test_obstacles fidelity"
+)
 
 values = st.one_of(
     st.sampled_from(VALUES.split()),
