@@ -56,7 +56,7 @@ def smallest(values: Array, count: int) -> Array:
     Counting, and for long lists a few minima one after another, are faster than a sort.
 
     Args:
-        values: (n,) finite numbers.
+        values: (n,) numbers below the greatest of their type.
         count: how many are wanted, at most n.
 
     Returns:
@@ -69,7 +69,7 @@ def smallest(values: Array, count: int) -> Array:
     def take(left: Array, _: None) -> tuple[Array, Array]:
         # Two minima instead of an argmin, since they vectorise.
         least = jnp.min(jnp.where(left == jnp.min(left), index, len(values)))
-        return jnp.where(index == least, jnp.inf, left), least
+        return jnp.where(index == least, jnp.finfo(left.dtype).max, left), least
 
     return jax.lax.scan(take, values, length=count)[1]
 

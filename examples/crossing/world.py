@@ -124,6 +124,7 @@ class Params(struct.PyTreeNode):
     pedestrians: int = struct.field(pytree_node=False, default=6)
 
 
+@jax.ensure_compile_time_eval()  # tables of plain numbers, also where a caller is being traced
 def make_params(pedestrians: int = 6, time_limit: int = 100) -> Params:
     """Returns a road with so many pedestrians.
 
@@ -182,7 +183,7 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
     way = reached.body.position[0] - state.body.position[0]
     terminated, truncated = contract.ended(crashed | goal, reached.time, params.time_limit)
     return reached, contract.Outcome(
-        reward=10.0 * way - 0.05 + 5.0 * goal,
+        reward=10.0 * way - 0.05 + jnp.where(goal, 5.0, 0.0),
         danger=crashed.astype(way.dtype),
         terminated=terminated,
         truncated=truncated,

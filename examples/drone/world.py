@@ -72,7 +72,7 @@ class Obstacle(struct.PyTreeNode):
 
     def features(self, body: Motion, hazard: Motion) -> Array:
         """Returns (6,): position from the drone (of a wall, only y), both velocities."""
-        relative = (hazard.position - body.position) * jnp.asarray(self.axes)
+        relative = (hazard.position - body.position) * jnp.asarray(self.axes, float)
         return jnp.concatenate([relative, body.velocity, hazard.velocity])
 
     def state_of(self, features: Array) -> tuple[Motion, Motion]:
@@ -125,7 +125,7 @@ def make_params(discs: int = 10, *, time_limit: int = 100) -> Params:
     """Returns parameters with so many discs; raises ValueError if a number is out of range."""
     number("discs", discs, least=SEEN, most=100, integer=True)
     number("time_limit", time_limit, least=1, most=10**9, integer=True)
-    table = ACCELERATION * jnp.asarray([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
+    table = ACCELERATION * jnp.asarray([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)], float)
     wall = Obstacle(0.1, axes=(0, 1))
     sources = {"disc": Obstacle(0.12, 0.02, 0.002), "pylon": Obstacle(0.1), "wall": wall}
     return Params(Drone(table, Brake()), sources, jnp.asarray(time_limit, jnp.int32), discs)
@@ -153,7 +153,7 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
     crashed = jnp.any(jnp.stack(list(hit.values())))
     left, before = (jnp.linalg.norm(jnp.asarray(GOAL) - b.position) for b in (body, state.body))
     goal = (left < NEAR) & ~crashed
-    reward = 10.0 * (before - left) - 0.05 + 5.0 * goal
+    reward = 10.0 * (before - left) - 0.05 + jnp.where(goal, 5.0, 0.0)
     ends = ended(crashed | goal, new.time, params.time_limit)
     return new, Outcome(reward, crashed.astype(reward.dtype), *ends, goal)
 

@@ -219,7 +219,7 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
     goal = (left < NEAR) & ~crashed
     terminated, truncated = contract.ended(crashed | goal, reached.time, params.time_limit)
     return reached, contract.Outcome(
-        reward=10.0 * (_way_left(state.body) - left) - 0.05 + 5.0 * goal,
+        reward=10.0 * (_way_left(state.body) - left) - 0.05 + jnp.where(goal, 5.0, 0.0),
         danger=crashed.astype(left.dtype),
         terminated=terminated,
         truncated=truncated,

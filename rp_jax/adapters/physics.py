@@ -66,7 +66,7 @@ class BraxBody(struct.PyTreeNode):
             control: (U,) actuator inputs.
         """
         system = load(self.model)
-        with quietly():
+        with quietly(), jax.numpy_dtype_promotion("standard"):  # brax relies on it
             state = pipeline.step(system, pipeline.init(system, body.q, body.qd), control)
         return JointState(q=state.q, qd=state.qd)
 
@@ -76,7 +76,8 @@ class BraxBody(struct.PyTreeNode):
         Args:
             body: the body's state.
         """
-        return kinematics.forward(load(self.model), body.q, body.qd)[0].pos
+        with jax.numpy_dtype_promotion("standard"):
+            return kinematics.forward(load(self.model), body.q, body.qd)[0].pos
 
     def mirrored_threats(self) -> np.ndarray:
         """Returns the index of each action's left-right mirror image, (A,) int.

@@ -57,6 +57,7 @@ class Params(struct.PyTreeNode):
     fidelity: str = struct.field(pytree_node=False, default="released")  # or "paper"
 
 
+@jax.ensure_compile_time_eval()  # tables of plain numbers, also where a caller is being traced
 def make_params(
     track: str | tracks.TrackPlan = "default",
     *,
@@ -186,7 +187,7 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
     else:
         progress = (passed + n // 2) % n - n // 2
     stopped = jnp.abs(reached.body.speed) < params.stop_speed
-    reward = progress.astype(params.stop_speed.dtype) - stopped
+    reward = progress.astype(params.stop_speed.dtype) - jnp.where(stopped, 1.0, 0.0)
     terminated, truncated = contract.ended(crashed, reached.time, params.time_limit)
     return reached, contract.Outcome(
         reward=reward,

@@ -68,7 +68,7 @@ def step(key: Array, state: State, action: Array, params: Params) -> tuple[State
         jnp.sqrt(squared_distance(corner, body.position)) for body in (state.body, reached.body)
     )
     arrived = (after < NEAR) & (outcome.danger == 0)
-    reward = 20 * (before - after) - 0.05 + 10.0 * arrived
+    reward = 20 * (before - after) - 0.05 + jnp.where(arrived, 10.0, 0.0)
     outcome = outcome.replace(reward=reward, goal=jnp.zeros_like(outcome.goal))
     return _heading_for(reached, jnp.where(arrived, 1 - state.aim, state.aim)), outcome
 

@@ -89,6 +89,7 @@ def cells() -> np.ndarray:
     return grid[np.abs(grid).max(axis=-1) > 0]
 
 
+@jax.ensure_compile_time_eval()  # tables of plain numbers, also where a caller is being traced
 def make_params(
     num_apples: int = 2,
     num_bombs: int = USUAL_BOMBS,

@@ -141,7 +141,7 @@ class DistanceField(struct.PyTreeNode):
         x = jnp.clip(position[0] * scale - self.origin[0] * scale, 0.0, nx - 1e-3)
         y = jnp.clip(position[1] * scale - self.origin[1] * scale, 0.0, ny - 1e-3)
         i, j = x.astype(jnp.int32), y.astype(jnp.int32)
-        u, v = x - i, y - j
+        u, v = x - i.astype(x.dtype), y - j.astype(y.dtype)
         c = self.corners.reshape(-1, 4).at[i * ny + j].get(mode="clip")  # nan is no index
         near, far = c[0] + v * (c[1] - c[0]), c[2] + v * (c[3] - c[2])
         return near + u * (far - near) - self.excess
@@ -245,8 +245,8 @@ def lidar(points: Array, position: Array, heading: Array, bins: int, view: float
     # as their bits, and minima of integers are faster.
     integer = jnp.dtype(f"int{8 * squared.dtype.itemsize}")
     bits = jax.lax.bitcast_convert_type(squared, integer)
-    none = jax.lax.bitcast_convert_type(jnp.asarray(jnp.inf, squared.dtype), integer)
+    none = np.asarray(np.finfo(squared.dtype).max).view(integer)  # not infinity: JAX_DEBUG_INFS
     best = jnp.full(bins + 1, none)
     best = best.at[jnp.where(seen, k, bins)].min(bits, mode="promise_in_bounds")[:bins]
-    best = jax.lax.bitcast_convert_type(best, squared.dtype)
-    return jnp.where(jnp.isinf(best), 0.0, jnp.sqrt(best))
+    distance = jnp.sqrt(jax.lax.bitcast_convert_type(best, squared.dtype))
+    return jnp.where(best == none, 0.0, distance)

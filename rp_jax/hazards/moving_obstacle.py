@@ -51,7 +51,7 @@ class MovingObstacle(struct.PyTreeNode):
             speeds=jnp.asarray(speeds, float),
             behaviour=behaviour,
             reach=Reach.create(model, horizon),
-            drift=jnp.arange(horizon) * behaviour.max_acceleration,
+            drift=jnp.arange(horizon, dtype=float) * behaviour.max_acceleration,
             horizon=horizon,
         )
 

@@ -82,9 +82,10 @@ class Reach(struct.PyTreeNode):
         if model.room is not None:  # sliding along a wall, it moves sideways at any heading
             swing, change = np.full(horizon, np.pi), np.full(horizon, np.inf)
         sides = np.where(swing < np.pi / 2, np.sin(swing), 1.0)
+        dtype = jax.dtypes.canonicalize_dtype(float)
         return cls(
             limits=jnp.asarray(model.speeds)[jnp.asarray([0, -1])],
-            change=jnp.asarray(change, float),
+            change=jax.device_put(np.asarray(change, dtype)),  # as is: infinite in a room
             swing=jnp.asarray(np.stack([np.cos(swing), sides], axis=-1), float),
         )
 

@@ -310,14 +310,16 @@ def test_driving_out_of_the_exit_is_the_goal(position, goal):
     np.testing.assert_allclose(outcome.reward, progress - 0.05 + 10 * goal, atol=1e-4)
 
 
-def test_a_crash_in_the_exit_is_no_goal():
-    state, outcome, hit = settled(at((2.6, 2.95), np.pi / 2, 0.1), [(2.7, 2.89)])
+@pytest.mark.parametrize(("fidelity", "reward"), [("released", 9.95), ("paper", -0.05)])
+def test_a_crash_in_the_exit_is_a_goal_as_well_if_as_released(fidelity, reward):
+    """From .05 below the goal to .05 above it: no progress."""
+    state, outcome, hit = settled(at((2.6, 2.95), np.pi / 2, 0.1), [(2.7, 2.89)], fidelity)
     assert hit["obstacle"]
     assert state.body.position[1] > 3
-    assert not outcome.goal
+    assert bool(outcome.goal) == (fidelity == "released")
     assert outcome.terminated
     assert outcome.danger == 1
-    assert outcome.reward < 1
+    np.testing.assert_allclose(outcome.reward, reward, atol=1e-4)
 
 
 @pytest.mark.parametrize(
