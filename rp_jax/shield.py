@@ -45,6 +45,8 @@ def shield(threat: Array, x: Array | float) -> Shield:
     """
     ranked(1, threat=threat)
     ranked(0, x=x) if hasattr(x, "shape") else number("x", x, infinite=True)
+    if isinstance(x, Array):
+        threat = threat_array(threat)
     allowed = threat <= narrowed(x, threat.dtype)
     secure = jnp.any(allowed)
     fallback = jnp.arange(threat.shape[0]) == greedy_eta(threat)
@@ -63,6 +65,27 @@ def narrowed(x: Any, dtype: Any) -> Any:
     if isinstance(x, Array):
         return x
     return rounded_down(x) if jnp.dtype(dtype).itemsize <= 4 else np.asarray(x, np.float64)
+
+
+def threshold_array(x: Any) -> Array:
+    """Returns thresholds as an array in JAX's precision, nowhere greater than they were given.
+
+    Args:
+        x: numbers, of any shape.
+    """
+    return jnp.asarray(narrowed(x, jax.dtypes.canonicalize_dtype(float)))
+
+
+def threat_array(threat: Any) -> Array:
+    """Returns threats as an array in JAX's precision, nowhere less than they were given.
+
+    Args:
+        threat: threats, of any shape; arrays of JAX are returned as they are.
+    """
+    if isinstance(threat, Array):
+        return threat
+    double = jax.dtypes.canonicalize_dtype(float) == np.float64
+    return jnp.asarray(threat, float) if double else jnp.asarray(rounded_up(threat))
 
 
 def rounded_down(x: Any) -> np.ndarray:

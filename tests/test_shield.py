@@ -16,6 +16,8 @@ from rp_jax.shield import (
     rounded_down,
     rounded_up,
     shield,
+    threat_array,
+    threshold_array,
 )
 
 A = 5
@@ -224,6 +226,24 @@ def test_no_threat_above_the_given_threshold_is_admitted_by_rounding_it(x):
     np.testing.assert_array_equal(both.admissible, within[:2])
 
 
+@pytest.mark.parametrize("double", [False, True])
+def test_threats_come_into_a_program_in_its_precision_and_not_below_themselves(double):
+    threat = np.asarray(
+        [0.1, 0.1 + 1e-9, 0.5, np.inf, np.nan]
+    )  # the nearest float32 is .10000000149
+    with jax.enable_x64(double):
+        found = np.asarray(threat_array(threat))
+        assert found.dtype == (np.float64 if double else np.float32)
+        assert not (found < threat).any()
+        np.testing.assert_array_equal(found[2:], threat[2:].astype(found.dtype))
+        traced = jnp.float32(0.25)
+        assert threat_array(traced) is traced
+        # .01 - 2e-10 is the nearest float32 to .01; a threat of .01 is above it.
+        limit = rounded_down(0.01)
+        allowed = shield(np.asarray([0.01, 0.009]), jnp.asarray(limit)).admissible
+        np.testing.assert_array_equal(allowed, [False, True])
+
+
 def test_thresholds_keep_what_needs_no_rounding():
     traced = jnp.float32(0.001)
     assert narrowed(traced, np.float32) is traced
@@ -231,3 +251,14 @@ def test_thresholds_keep_what_needs_no_rounding():
     assert narrowed(-np.inf, np.float32) == -np.inf
     assert narrowed(0.001, np.float64) == 0.001
     assert narrowed(0.5, np.float32) == 0.5
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_thresholds_come_into_a_program_in_its_precision_and_not_above_themselves(double):
+    given_as = [0.001, 0.01, 0.5, np.inf]
+    with jax.enable_x64(double):
+        found = threshold_array(given_as)
+    assert found.dtype == (np.float64 if double else np.float32)
+    below = [0.001, 0.01, 0.5, np.inf] if double else [9.9999993e-4, 9.9999998e-3, 0.5, np.inf]
+    np.testing.assert_array_equal(found, np.asarray(below, found.dtype))
+    assert (np.asarray(found, float) <= given_as).all()

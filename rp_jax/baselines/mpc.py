@@ -20,7 +20,7 @@ from rp_jax.envs.contract import Env
 from rp_jax.hazards import is_static
 from rp_jax.planning.percept import Percept
 from rp_jax.planning.pmdp import PMDP
-from rp_jax.shield import rounded_down
+from rp_jax.shield import threshold_array
 from rp_jax.streams import STATES, Stream, key_of
 from rp_jax.validate import number, shown
 
@@ -107,7 +107,7 @@ def make_search(
     return Search(
         params=params,
         penalty=jnp.asarray(penalty, float),
-        limit=jnp.asarray(rounded_down(limit), float),
+        limit=threshold_array(limit),
         model=model,
         horizon=horizon,
     )

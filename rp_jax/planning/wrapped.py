@@ -12,7 +12,7 @@ from rp_jax.copies import parts
 from rp_jax.envs import optional
 from rp_jax.envs.contract import Env, Hazards
 from rp_jax.hazards import SubRMDP
-from rp_jax.shield import rounded_down
+from rp_jax.shield import threshold_array
 from rp_jax.validate import number
 
 
@@ -47,7 +47,7 @@ def ranged(inner: Any, low: float, high: float) -> RangedParams:
     """
     number("low", low, above=0)
     number("high", high, least=low)
-    least, most = (jnp.asarray(rounded_down(x), float) for x in (low, high))
+    least, most = (threshold_array(x) for x in (low, high))
     return RangedParams(inner, least, most)
 
 

@@ -20,7 +20,7 @@ from rp_jax.planning.loop import LoopConfig
 from rp_jax.planning.percept import Percept
 from rp_jax.planning.pmdp import PMDP
 from rp_jax.runs.record import short_name
-from rp_jax.shield import rounded_down
+from rp_jax.shield import threshold_array
 from rp_jax.threat.function import ThreatFunction
 from rp_jax.validate import number, shown
 
@@ -204,7 +204,7 @@ def with_member(pmdp: PMDP, member: Member) -> PMDP:
         member: one of them.
     """
     return pmdp.replace(
-        x=jnp.asarray(rounded_down(member.x), float),
+        x=threshold_array(member.x),
         penalty=jnp.asarray(member.learning_penalty, float),
     )
 
@@ -216,7 +216,7 @@ def side_by_side(pmdp: PMDP, members: Sequence[Member]) -> tuple[PMDP, PMDP]:
         pmdp: with a threshold and a penalty of one agent.
         members: (n,) whose thresholds and penalties replace these.
     """
-    x = jnp.asarray(rounded_down([member.x for member in members]), float)
+    x = threshold_array([member.x for member in members])
     penalty = jnp.asarray([member.learning_penalty for member in members], float)
     axes = pmdp.replace(
         params=None, threats=None, x=0, penalty=0, insecure_penalty=None, correction=None

@@ -25,7 +25,7 @@ from rp_jax.planning.pmdp import PMDP
 from rp_jax.runs import record, saved, training
 from rp_jax.runs.agents import Agents, Member, side_by_side
 from rp_jax.runs.progress import OnMetrics, OnProgress, silent
-from rp_jax.shield import rounded_down
+from rp_jax.shield import threshold_array
 from rp_jax.streams import Stream, key_of, numbered
 from rp_jax.threat import artefact
 from rp_jax.threat.function import ThreatFunction
@@ -333,7 +333,7 @@ def make_pmdp(
         params=params,
         threats={} if threat is None else dict(threat.models),
         correction=None if threat is None else threat.correction,
-        x=jnp.asarray(rounded_down(x), float),
+        x=threshold_array(x),
         penalty=jnp.asarray(learning_penalty, float),
         insecure_penalty=jnp.asarray(insecure_penalty, float),
         env=env,

@@ -20,7 +20,7 @@ from rp_jax.planning.pmdp import PMDP
 from rp_jax.recon import labels
 from rp_jax.runs import record
 from rp_jax.runs.progress import OnProgress, silent
-from rp_jax.shield import rounded_down
+from rp_jax.shield import threshold_array
 from rp_jax.streams import Stream, key_of
 from rp_jax.threat import artefact, build, report
 from rp_jax.threat.build import ThreatConfig
@@ -271,7 +271,7 @@ def drawn_sums(
     pmdp = PMDP(
         params=params,
         threats=dict(models),
-        x=jnp.asarray(rounded_down(x), float),
+        x=threshold_array(x),
         penalty=jnp.zeros(()),
         insecure_penalty=jnp.zeros(()),
         env=env,

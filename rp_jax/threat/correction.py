@@ -103,7 +103,7 @@ def calibrated_sum(
         limits[j] = min(limits[j], APART * limits[j + 1])
     ascending = np.maximum(limits, LEAST * (1 + np.arange(len(limits))))
     found = SumCorrection(jnp.asarray([*ascending, 1.0], float), jnp.asarray([*LEVELS, 1.0], float))
-    called = np.asarray(found(jnp.asarray(said, float)))
+    called = np.asarray(found(jnp.asarray(said, float)), float)
     statements = [
         Statement(
             level=level,
