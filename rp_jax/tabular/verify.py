@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rp_jax.tabular import exact, factored, secure, thresholds
+from rp_jax.tabular import budgets, exact, factored, secure, thresholds
 from rp_jax.tabular.cmdp import FiniteCMDP
 
 BETAS = (0.0, 0.5, 0.9, 0.999, 1 - 1e-6, 1.0)
@@ -386,6 +386,105 @@ def evaluated(case: Instance) -> Array:
     return jnp.max(jnp.stack([danger(x) - c, early, behind]))
 
 
+def account(case: Instance) -> Array:
+    """Checks that the danger of a policy is m_0 + E sum beta^t (V_t - m_t), for any functions m.
+
+    Args:
+        case: an instance.
+
+    Returns:
+        () the difference.
+    """
+    cmdp = case.cmdp
+    found = exact.threat(cmdp, case.eta)
+    broken = []
+    for policy in (case.eta, case.other):
+        danger = _danger(case, exact.threat(cmdp, policy))
+        for least in (3 * case.noise[..., 0], found.action.min(axis=-1), -found.state):
+            broken.append(jnp.abs(budgets.accounted(cmdp, least, policy) - danger))
+    return jnp.max(jnp.stack(broken))
+
+
+def _promised(case: Instance, found: budgets.Costs) -> tuple[Array, Array]:
+    """Returns a budget of the start, often one that an action just fits, and c, () each."""
+    fitting = found.excess.ravel()
+    index = (case.share * 64 * fitting.size).astype(int) % fitting.size
+    budget = jnp.where(case.share < 1, fitting[index], case.x[0])
+    return budget, case.cmdp.start @ found.least[0] + budget
+
+
+def budget(case: Instance) -> Array:
+    """Checks that no policy that keeps to its budget has more danger than c, and the errors of U.
+
+    Without refunds that is c + E sum beta^t e_t, with refunds c plus the expected overspend. U is a
+    threat, one above or below it, or anything.
+
+    Args:
+        case: an instance with a finite horizon.
+
+    Returns:
+        () the violation.
+    """
+    cmdp = case.cmdp
+    threats = exact.threat(cmdp, case.eta).action
+    uppers = (threats, threats + 0.3 * case.noise, threats * case.noise, case.noise)
+    upper = jnp.stack(uppers)[(case.share * 1000).astype(int) % 4]
+    found = budgets.costs(cmdp, upper)
+    start, c = _promised(case, found)
+    errors = lambda t, _: found.error[t]  # noqa: E731
+    overspent = lambda t, held: jnp.maximum(found.cost[t] - held[:, None, None], 0)  # noqa: E731
+    without = _worst_within(cmdp, found.excess, found.excess, errors, start)
+    refunded = _worst_within(cmdp, found.excess, found.cost, overspent, start)
+    return jnp.maximum(without, refunded) - c
+
+
+def _worst_within(
+    cmdp: FiniteCMDP, excess: Array, cost: Array, toll: Callable[[int, Array], Array], start: Array
+) -> Array:
+    """Returns the greatest E sum (beta^t d - toll) of all policies that keep to a budget, ().
+
+    It is exact: by recursion over all budgets that can be left after any states and actions.
+
+    Args:
+        cmdp: the CMDP.
+        excess: (H, S, A) what actions need.
+        cost: (H, S, A) what they are charged.
+        toll: maps a step and budgets (N,) to tolls (N, S, A) or (S, A).
+        start: () the first budget.
+    """
+    horizon, states, actions = cmdp.shape
+    fitting = jax.vmap(jax.vmap(budgets.budget_actions, in_axes=(0, None)), in_axes=(None, 0))
+    held = [start[None]]
+    for t in range(horizon - 1):
+        held.append(budgets.spend(held[t][:, None, None], cost[t]).ravel())
+    ahead = jnp.zeros((len(held[-1]), states, actions, states))
+    for t in reversed(range(horizon)):
+        gain = cmdp.beta**t * cmdp.danger - toll(t, held[t])
+        action = gain + jnp.einsum("saz,nsaz->nsa", cmdp.transition, ahead)
+        state = jnp.max(jnp.where(fitting(excess[t], held[t]), action, -jnp.inf), axis=-1)
+        ahead = state.reshape(-1, states, actions, states) if t else state
+    return cmdp.start @ ahead[0]
+
+
+def budget_in_levels(case: Instance) -> Array:
+    """Checks that no policy has more danger than c if budgets are counted in a few whole levels.
+
+    Args:
+        case: an instance with a finite horizon.
+
+    Returns:
+        () the violation.
+    """
+    cmdp = case.cmdp
+    upper = exact.threat(cmdp, case.eta).action
+    _, c = _promised(case, budgets.costs(cmdp, upper))
+    broken = []
+    for refund in (False, True):
+        rule = budgets.budget_rule(cmdp, upper, c, refund=refund, levels=6)
+        broken.append(budgets.at_start(cmdp, rule, budgets.worst(cmdp, rule)) - c)
+    return jnp.maximum(*broken)
+
+
 CHECKS: dict[str, Callable[[Instance], Array]] = {
     "theorem 1": theorem_1,
     "theorem 2": theorem_2,
@@ -395,9 +494,12 @@ CHECKS: dict[str, Callable[[Instance], Array]] = {
     "certificate": certificate,
     "advantage": advantage,
     "evaluated": evaluated,
+    "account": account,
+    "budget": budget,
+    "budget in levels": budget_in_levels,
 }
 
-FINITE = ("theorem 1", "theorem 2")  # for a finite horizon only, since z is counted step by step
+FINITE = ("theorem 1", "theorem 2", "budget", "budget in levels")  # counted step by step
 
 
 def draw_factored(
