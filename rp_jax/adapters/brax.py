@@ -255,7 +255,7 @@ class ShieldWrapper(Wrapper):
         Returns:
             The state after.
         """
-        threat = self.threat(state)
+        threat = shield.threat_array(self.threat(state))
         function = functools.partial(shield.correct, x=self.x, table=self.table)
         for _ in range(threat.ndim - 1):
             function = jax.vmap(function)

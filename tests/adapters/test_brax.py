@@ -233,6 +233,18 @@ def test_a_threat_just_above_the_threshold_is_not_rounded_into_it():
     assert state.info["intervention"] == 1
 
 
+def test_threats_in_double_precision_are_not_rounded_down_to_the_threshold():
+    x = float(np.float32(0.01))
+    above = np.asarray([[0.01, 0.0, 0.0, 0.0]])  # by 2e-10; the nearest float32 is x
+    assert above[0, 0] > x
+    for lead in (True, False):
+        env = brax.training.VmapWrapper(Counter()) if lead else Counter()
+        env = brax.ShieldWrapper(env, lambda state, lead=lead: above if lead else above[0], x)
+        state = env.reset(raws(0, 1) if lead else raw(0))
+        state = jax.jit(env.step)(state, jnp.zeros((1,) * lead, jnp.int32))
+        assert (state.info["intervention"] == 1).all()
+
+
 def test_a_shield_inside_the_training_wrappers_counts_by_episode():
     env = brax.ShieldWrapper(Counter(), threat_of, 0.125)
     env = brax.wrap(env, 100)

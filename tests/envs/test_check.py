@@ -1095,6 +1095,9 @@ def test_who_shares_memory_is_told_by_name():
     assert shared_memory("reset", state, params) == []
     (problem,) = shared_memory("reset", state, params.replace(time_limit=state.time))
     assert problem.startswith("reset: state.time and params.time_limit are one array; state.time ")
+    kept = state.replace(time=state.time + 1)  # such as an array of the module's
+    (problem,) = shared_memory("reset", kept, params, state)
+    assert problem.startswith("reset: state.body.position and another state.body.position are one")
     twice = state.replace(body=state.body.replace(heading=state.body.position))
     (problem,) = shared_memory("step", twice, params)
     assert problem.startswith("step: state.body.heading and state.body.position are one array")

@@ -90,7 +90,8 @@ def test_a_state_has_memory_of_its_own_which_may_be_given_away(name):
     env, make = (ENVS | APART)[name]
     params = make()
     state = env.reset(jax.random.key(0), params)
-    assert shared_memory("reset", state, params) == []
+    other = env.reset(jax.random.key(0), params)
+    assert shared_memory("reset", state, params, other) == []
     if name == "budgeted":
         jax.jit(env.step, donate_argnums=1)(jax.random.key(1), state, jnp.asarray(0), params)
         assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(params))

@@ -19,11 +19,12 @@ def impurities(trial: Trial) -> list[str]:
     Args:
         trial: the environment.
     """
-    key = typed(trial.draws.keys(1)[0])
-    start = trial.env.reset(key, trial.params)
+    key = trial.draws.keys(1)[0]
+    start = trial.env.reset(typed(key), trial.params)
     first = _host(start)
-    found = shared_memory("reset", start, trial.params) + _of_step(trial)
-    again = first_difference(first, _host(trial.env.reset(key, trial.params)), "state", bits=True)
+    other = trial.env.reset(typed(key), trial.params)
+    found = shared_memory("reset", start, trial.params, other) + _of_step(trial)
+    again = first_difference(first, _host(other), "state", bits=True)
     if again is not None:
         found.append(
             f"reset is not pure: for the same key, {again}; it must depend on its arguments alone"
@@ -65,15 +66,17 @@ def _of_step(trial: Trial) -> list[str]:
     return found
 
 
-def shared_memory(what: str, state: Any, params: Any) -> list[str]:
-    """Returns what says that a state's arrays are also in the parameters, or twice in the state.
+def shared_memory(what: str, state: Any, params: Any, other: Any = ()) -> list[str]:
+    """Returns what says that a state's arrays are also elsewhere, or twice in the state.
 
     Args:
         what: the function that returned the state, for the sentence.
         state: a state, from a function that was not compiled.
         params: the parameters that the function was given.
+        other: another state, from another call of the function.
     """
-    names = {place: f"params{path}" for path, place in _places(params)}
+    names = {place: f"another state{path}" for path, place in _places(other)}
+    names |= {place: f"params{path}" for path, place in _places(params)}
     for path, place in _places(state):
         if place in names:
             return [
