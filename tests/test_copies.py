@@ -16,6 +16,7 @@ from rp_jax.planning.loop import LoopConfig, make_network
 from rp_jax.planning.wrapped import Wrapped
 from rp_jax.runs.agents import Agents, Member
 from rp_jax.runs.train import World
+from rp_jax.threat.function import ThreatFunction
 
 PMDP = probe.make_pmdp(probe, probe.make_params(), x=0.5)
 NETWORK = make_network(LoopConfig(), PMDP)
@@ -102,3 +103,11 @@ def test_what_is_met_twice_is_copied_once():
     assert again[0].module is again[1].inner.module is probe
     assert again[0].rest is again[1].inner.rest == one
     assert again[0].rest is not one
+
+
+def test_a_deep_copy_of_a_threat_function_is_equal_and_independent():
+    threat = ThreatFunction({}, circuit.sub_rmdps(circuit.make_params()), {"sums": {}})
+    again = copy.deepcopy(threat)
+    assert again.checksum == threat.checksum
+    again.about["sums"]["wall"] = 1
+    assert threat.about == {"sums": {}}
