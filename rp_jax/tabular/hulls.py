@@ -155,7 +155,7 @@ def _edges(hulls: Sequence[Hull], chances: np.ndarray) -> tuple[np.ndarray, np.n
     They are the state that each belongs to, and its extent in danger and in return, (n,) each.
     """
     met = np.flatnonzero(chances > 0).tolist()
-    owner = np.repeat(met, [len(hulls[i].danger) - 1 for i in met])
+    owner = np.repeat(np.asarray(met, int), [len(hulls[i].danger) - 1 for i in met])
     if len(owner) == 0:
         return owner, np.zeros(0), np.zeros(0)
     harm = np.concatenate([np.diff(hulls[i].danger) for i in met])

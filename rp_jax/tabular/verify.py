@@ -431,8 +431,13 @@ def budget(case: Instance) -> Array:
     upper = jnp.stack(uppers)[(case.share * 1000).astype(int) % 4]
     found = budgets.costs(cmdp, upper)
     start, c = _promised(case, found)
-    errors = lambda t, _: found.error[t]  # noqa: E731
-    overspent = lambda t, held: jnp.maximum(found.cost[t] - held[:, None, None], 0)  # noqa: E731
+
+    def errors(t: int, _: Array) -> Array:
+        return found.error[t][None]
+
+    def overspent(t: int, held: Array) -> Array:
+        return jnp.maximum(found.cost[t][None] - held[:, None, None], 0)
+
     without = _worst_within(cmdp, found.excess, found.excess, errors, start)
     refunded = _worst_within(cmdp, found.excess, found.cost, overspent, start)
     return jnp.maximum(without, refunded) - c
@@ -449,17 +454,17 @@ def _worst_within(
         cmdp: the CMDP.
         excess: (H, S, A) what actions need.
         cost: (H, S, A) what they are charged.
-        toll: maps a step and budgets (N,) to tolls (N, S, A) or (S, A).
+        toll: maps a step and budgets (N,) to tolls (N, S, A), or (1, S, A).
         start: () the first budget.
     """
     horizon, states, actions = cmdp.shape
     fitting = jax.vmap(jax.vmap(budgets.budget_actions, in_axes=(0, None)), in_axes=(None, 0))
     held = [start[None]]
     for t in range(horizon - 1):
-        held.append(budgets.spend(held[t][:, None, None], cost[t]).ravel())
+        held.append(budgets.spend(held[t][:, None, None], cost[t][None]).ravel())
     ahead = jnp.zeros((len(held[-1]), states, actions, states))
     for t in reversed(range(horizon)):
-        gain = cmdp.beta**t * cmdp.danger - toll(t, held[t])
+        gain = cmdp.beta**t * cmdp.danger[None] - toll(t, held[t])
         action = gain + jnp.einsum("saz,nsaz->nsa", cmdp.transition, ahead)
         state = jnp.max(jnp.where(fitting(excess[t], held[t]), action, -jnp.inf), axis=-1)
         ahead = state.reshape(-1, states, actions, states) if t else state

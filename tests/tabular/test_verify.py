@@ -18,6 +18,7 @@ from quick import compile_soon  # noqa: F401
 from experiments import theorems
 from rp_jax import shield
 from rp_jax.tabular import (
+    budgets,
     cmdp,
     exact,
     factored,
@@ -125,6 +126,13 @@ def violated(program, horizon, count=1_000):
     counts = {name: int((each > 1e-6).sum()) for name, each in values.items()}
     print(counts)  # shown if a test fails
     return counts
+
+
+def budget_alone(key, horizon):
+    """Violations of the budget's checks, and of no others: they are ready sooner."""
+    case = verify.draw(key, 3, 3, horizon)
+    greatest = thresholds.effective_horizon(case.cmdp.beta, horizon)
+    return {name: verify.CHECKS[name](case) / greatest for name in ("budget", "budget in levels")}
 
 
 cmdps = functools.partial(verify.violations, states=4, actions=3)
@@ -260,3 +268,59 @@ def test_single_precision_never_admits_what_double_precision_rejects():
 
 def test_plain_rounding_to_single_precision_is_caught():
     assert admits_more(lambda action, x: (np.float32(action), np.float32(x)))
+
+
+def times_beta_again(cmdp, upper, right=budgets.costs):
+    """Costs of step t as if they were beta^2t of what they are: each budget divided twice."""
+    found = right(cmdp, upper)
+    weight = (cmdp.beta ** jnp.arange(len(upper)))[:, None, None]
+    return found._replace(excess=weight * found.excess, cost=weight * found.cost)
+
+
+def of_another_step(cmdp, upper, right=budgets.costs):
+    """Least dangers of the next step in place of this one's."""
+    later = jnp.append(upper[1:], upper[-1:], axis=0).min(axis=-1)
+    found = right(cmdp, upper)
+    weight = (cmdp.beta ** jnp.arange(len(upper)))[:, None, None]
+    changed = weight * (found.least - later)[..., None]
+    return found._replace(least=later, excess=found.excess + changed, cost=found.cost + changed)
+
+
+def refunding_more(cmdp, upper, right=budgets.costs):
+    found = right(cmdp, upper)
+    return found._replace(cost=found.cost - 0.02)
+
+
+def without_errors(cmdp, upper, right=budgets.costs):
+    found = right(cmdp, upper)
+    return found._replace(error=0 * found.error)
+
+
+@pytest.mark.parametrize(
+    "wrong", [times_beta_again, of_another_step, refunding_more, without_errors]
+)
+def test_wrong_costs_are_caught(monkeypatch, wrong):
+    assert violated(budget_alone, 3)["budget"] == 0
+    monkeypatch.setattr(budgets, "costs", wrong)
+    assert violated(budget_alone, 3)["budget"] > 5
+
+
+def test_budgets_that_are_not_spent_are_caught(monkeypatch):
+    monkeypatch.setattr(budgets, "spend", lambda budget, cost: budget - 0 * cost)
+    assert violated(budget_alone, 3)["budget"] > 100
+
+
+def rounded_to_the_nearest(danger, size, most):
+    return jnp.clip(jnp.round(danger / size), -most, most).astype(jnp.int32)
+
+
+def test_costs_rounded_to_the_nearest_level_are_caught(monkeypatch):
+    monkeypatch.setattr(budgets, "in_levels", rounded_to_the_nearest)
+    assert violated(budget_alone, 3)["budget in levels"] > 100
+
+
+def test_the_bounds_of_budgets_are_attained():
+    keys = jax.random.split(jax.random.key(4), 1_000)
+    many = jax.jit(jax.vmap(lambda key: budget_alone(key, horizon=3)))
+    for name, values in many(keys).items():
+        assert (np.asarray(values) > -1e-12).sum() > 20, name
