@@ -122,7 +122,7 @@ def test_a_lidar_that_is_no_number_is_not_hidden_in_bytes(wrong):
 class Threatened(PMDP):
     """One state's threats hold a number that is none, whatever they come from."""
 
-    def threat(self, states, alive=None):
+    def _total(self, states, alive=None):
         there = (states.time == 2)[:, None] & (jnp.arange(3) == 1)
         wrong = self.insecure_penalty  # which serves for nothing else here
         return jnp.where(there, wrong, jnp.zeros((states.time.shape[0], 3)))

@@ -17,7 +17,7 @@ EXACT = np.mean([stats.binom.sf(5 - start, LIMIT, 1 - SLIP) for start in probe.S
 class Graded(PMDP):
     """Threat grows towards the pit; nothing is forbidden."""
 
-    def threat(self, states, alive=None):
+    def _total(self, states, alive=None):
         cell = states.body.position[:, 0] / 10
         return jnp.tile(cell[:, None], (1, 3))
 

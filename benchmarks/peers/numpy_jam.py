@@ -90,7 +90,7 @@ def finished(state: State, body: np.ndarray, obstacles: np.ndarray) -> Step:
     walls = np.hypot(*(POINTS - body[:2]).T) < RADIUS
     others = np.hypot(*(obstacles[:, :2] - body[:2]).T) < 2 * RADIUS
     crashed = bool(walls.any() or others.any())
-    goal = bool(body[Y] > jam.ROOM) and not crashed
+    goal = bool(body[Y] > jam.ROOM)
     reached = State(body, obstacles, _progress(body), state.time + 1)
     slow = 0.05 * (abs(body[SPEED]) < 0.005)
     reward = reached.progress - state.progress - 0.05 - slow + 10.0 * goal

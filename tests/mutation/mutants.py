@@ -21,7 +21,11 @@ MUTANTS = [
     *_of(
         "shield.py",
         "tests/test_shield.py",
-        ("a threat of exactly x is refused", "allowed = threat <= x", "allowed = threat < x"),
+        (
+            "a threat of exactly x is refused",
+            "allowed = threat <= narrowed",
+            "allowed = threat < narrowed",
+        ),
         ("the most threatening fallback", "jnp.argmin(jnp.where(", "jnp.argmax(jnp.where("),
         (
             "nan is the least threat",
@@ -115,18 +119,18 @@ MUTANTS = [
         ),
         (
             "life after a crash in the backup",
-            "going = flat(~outcome.terminated)",
-            "going = flat(~outcome.terminated) | True",
+            "going = flat(~outcome.done)",
+            "going = flat(~outcome.done) | True",
         ),
         (
             "the backup forgets the step's danger",
-            "flat(outcome.danger) + jnp",
-            "0 * flat(outcome.danger) + jnp",
+            "flat(outcome.danger) + least",
+            "0 * flat(outcome.danger) + least",
         ),
         (
             "look-ahead where it is not needed",
-            "insecure = jnp.min(summed, axis=-1) > ",
-            "insecure = jnp.min(summed, axis=-1) < ",
+            "insecure = ~jnp.any(summed <= level",
+            "insecure = jnp.any(summed <= level",
         ),
     ),
     *_of(
@@ -315,8 +319,8 @@ MUTANTS = [
         ("walls cannot be hit", 'hit["wall"] | hit["obstacle"]', 'hit["obstacle"]'),
         (
             "the goal after a crash",
-            "(body.position[1] > params.room) & ~crashed",
-            "(body.position[1] > params.room)",
+            "goal = goal & ~crashed",
+            "goal = goal | crashed",
         ),
     ),
     *_of(
@@ -511,12 +515,12 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "planning/conditioned.py",
+        "planning/wrapped.py",
         "tests/planning/test_conditioned.py",
         (
             "thresholds drawn alike, not their logarithms",
-            "x = jnp.exp(low + jax.random.uniform(draw, (), low.dtype) * (high - low))",
-            "x = params.low + jax.random.uniform(draw, (), low.dtype) * (params.high - params.low)",
+            "level = jnp.exp(low + jax.random.uniform(key, (), low.dtype) * (high - low))",
+            "level = params.low + jax.random.uniform(key, ()) * (params.high - params.low)",
         ),
     ),
     *_of(
@@ -524,8 +528,8 @@ MUTANTS = [
         "tests/adapters/test_gymnasium.py",
         (
             "the shield lets the wish pass",
-            "chosen = _correct(threat, wish, self._x, self._table)",
-            "chosen = _correct(0 * threat, wish, self._x, self._table)",
+            "chosen = _correct(threat, wish, self._threshold(threat)",
+            "chosen = _correct(0 * threat, wish, self._threshold(threat)",
         ),
     ),
 ]

@@ -22,7 +22,7 @@ SIZES = CrashConfig(episodes=50, most=4, steps=3, tries=32, checks=400)
 class Careless(PMDP):
     """Takes no action to be a threat, but the one that leaves the last cell before the pit."""
 
-    def threat(self, states, alive=None):
+    def _total(self, states, alive=None):
         near = states.body.position[:, :1] >= 5
         rising = jnp.asarray([[0.2, 0.3, 0.4]])
         return jnp.where(near, rising, 0.0)

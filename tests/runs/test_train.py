@@ -19,15 +19,9 @@ from rp_jax.threat import artefact
 
 PROMISED = [
     *("env", "variant", "method", "seed", "episodes", "return_mean", "return_ci95"),
-    *(
-        "uncrashed_return_mean",
-        "crashes",
-        "crash_rate",
-        "crash_upper95",
-        "danger_mean",
-        "goal_rate",
-    ),
-    *("interventions", "insecure", "seconds_per_100_actions", "train_seconds"),
+    *("uncrashed_return_mean", "crashes", "crash_rate", "crash_upper95", "threat"),
+    *("danger_mean", "goal_rate", "interventions", "insecure"),
+    *("promised", "booked_mean", "booked_ci95", "seconds_per_100_actions", "train_seconds"),
 ]
 
 
@@ -62,7 +56,7 @@ def check_table(folder, variants, seeds):
         (variant, seed) for variant in variants for seed in seeds
     ]
     for row in rows:
-        assert set(PROMISED) <= set(row)
+        assert set(PROMISED) - {"promised", "booked_mean", "booked_ci95"} <= set(row)
         assert row["episodes"] == 16
         assert row["crash_rate"] == row["crashes"] / 16 <= row["crash_upper95"]
         assert 0 <= row["interventions"] <= 1
